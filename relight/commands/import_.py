@@ -1,0 +1,63 @@
+"""`relight import`: a session from what a camera, a tool or a data set left behind."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+EXAMPLE = "relight import VID_20261102_101530.mp4 --poses cameras.json --points points.ply --out S"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The flags of `relight import`."""
+    parser.add_argument(
+        "source",
+        nargs="+",
+        type=Path,
+        metavar="SOURCE",
+        help="videos of one capture, a folder or file of posed images (cameras.json), a COLMAP model, "
+        "or a nerfstudio transforms.json",
+    )
+    parser.add_argument("--out", required=True, type=Path, metavar="SESSION", help="session folder to make")
+    parser.add_argument(
+        "--flash-list", type=Path, metavar="FILE", help="which frames are lit, for sources that do not say"
+    )
+    parser.add_argument("--poses", type=Path, metavar="FILE", help="cameras.json with the poses of a video")
+    parser.add_argument("--points", type=Path, metavar="FILE", help="point cloud, .ply")
+    parser.add_argument("--masks", type=Path, metavar="DIR", help="masks of the head, named like the frames")
+    parser.add_argument(
+        "--transfer",
+        metavar="NAME",
+        help="transfer function of the pictures when the source does not say or is wrong: linear, srgb, rec709, "
+        "gamma:2.2, log:100, jtvideo, jtlog, jtlog2",
+    )
+    parser.add_argument(
+        "--keep-location", action="store_true", help="keep where it was filmed; by default it is left out"
+    )
+    parser.add_argument(
+        "--rate",
+        type=float,
+        default=6.0,
+        metavar="HZ",
+        help="frames kept of each second of a video beside the lit ones (default 6)",
+    )
+
+
+def run(args: argparse.Namespace) -> None:
+    """Imports and says what came of it."""
+    from capture.importers import ImportOptions, import_source
+    from relight.commands.progress import StageProgress
+    from relight.commands.summary import describe_session
+
+    options = ImportOptions(
+        flash_list=args.flash_list,
+        poses=args.poses,
+        points=args.points,
+        masks=args.masks,
+        transfer=args.transfer,
+        keep_location=args.keep_location,
+        kept_rate_hz=args.rate,
+    )
+    with StageProgress() as progress:
+        session = import_source(args.source, args.out, options, progress)
+    print(describe_session(session))
