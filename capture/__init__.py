@@ -1,0 +1,1 @@
+"""From devices, videos and image sets to a session folder: the one contract between capture and fit."""
