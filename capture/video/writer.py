@@ -1,8 +1,4 @@
-"""Video files through PyAV: a streaming reader by the stream's own clock, a writer of what phones write.
-
-Pictures stay in sensor orientation: nothing here rotates. `rotation_deg` is the clockwise turn that makes the
-picture upright, as Android's orientation hint (90 for a phone held upright). FFmpeg counts the other way.
-"""
+"""Writer of video files as phones write them, for simulators and tests."""
 
 from __future__ import annotations
 
@@ -21,7 +17,7 @@ from av.video.stream import VideoStream
 from numpy.typing import NDArray
 
 from capture.errors import SourceError
-from capture.video_colour import (
+from capture.video.colour import (
     MATRIX_CODES,
     PRIMARIES_CODES,
     RANGE_CODES,
