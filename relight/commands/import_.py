@@ -28,8 +28,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--transfer",
         metavar="NAME",
-        help="transfer function of the pictures when the source does not say or is wrong: linear, srgb, rec709, "
-        "gamma:2.2, log:100, jtvideo, jtlog, jtlog2",
+        help="transfer function of the pictures where the source does not say it or is wrong: linear, srgb, "
+        "rec709, gamma:2.2, log:100, jtvideo, jtlog, jtlog2",
     )
     parser.add_argument(
         "--keep-location", action="store_true", help="keep where it was filmed; by default it is left out"
@@ -46,7 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> None:
     """Imports and says what came of it."""
     from capture.importers import ImportOptions, import_source
-    from relight.commands.progress import StageProgress
+    from capture.terminal import StageProgress
     from relight.commands.summary import describe_session
 
     options = ImportOptions(

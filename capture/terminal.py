@@ -1,21 +1,61 @@
-"""How long work is shown: a bar on a terminal, one line a stage elsewhere; always on stderr."""
+"""What commands owe a person at a terminal: progress while it lasts, one sentence and a code when it fails.
+
+0    the work is done
+1    it is not, and the sentence on stderr says why and what to do next
+2    the command line was not understood
+70   an error that nobody foresaw; `--debug` shows where
+130  stopped by Ctrl-C
+"""
 
 from __future__ import annotations
 
+import os
 import sys
 import time
+import traceback
+from collections.abc import Callable
 from types import TracebackType
 from typing import TYPE_CHECKING, Self, TextIO
+
+from capture.errors import RelightError
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
 
-class StageProgress:
-    """A callable `(stage, fraction)` for functions that report progress, and the context that draws it.
+def run_guarded(program: str, work: Callable[[], None], *, debug: bool) -> int:
+    """Does `work`; whatever it raises becomes one sentence on stderr and an exit code."""
+    try:
+        work()
+        sys.stdout.flush()
+    except RelightError as error:
+        _complain(program, str(error), debug)
+        return 1
+    except KeyboardInterrupt:
+        _complain(program, "stopped; what was written so far is whole.", debug)
+        return 130
+    except BrokenPipeError:
+        # The reader of our output went away (`relight plan S | head`): there is nowhere left to say anything.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    except OSError as error:
+        place = f"{error.filename}: " if error.filename else ""
+        _complain(program, f"{place}{error.strerror or error}.", debug)
+        return 1
+    except Exception as error:
+        hint = "" if debug else " Run it again with --debug to see where, and report that."
+        _complain(program, f"unforeseen {type(error).__name__}: {error}.{hint}", debug)
+        return 70
+    return 0
 
-    A stage begins when it is first named and ends when another one is, or the context does. Fractions are 0..1;
-    one that falls back within a stage is taken as it is (a loop may turn out longer).
+
+class StageProgress:
+    """Shows progress on stderr: a bar on a terminal, a line a stage elsewhere.
+
+    A callable `(stage, fraction)` for functions that report progress, and the context that draws it.
+
+    A stage begins when it is first named and ends when another one is, or the context does. Fractions are
+    0..1; one that falls back within a stage is taken as it is (a loop may turn out longer).
     """
 
     def __init__(self, stream: TextIO | None = None) -> None:
@@ -73,3 +113,9 @@ def _bars(stream: TextIO) -> Progress:
         TimeElapsedColumn(),
         console=Console(file=stream),
     )
+
+
+def _complain(program: str, sentence: str, debug: bool) -> None:
+    if debug:
+        traceback.print_exc()
+    print(f"{program}: {sentence}", file=sys.stderr)

@@ -1,0 +1,51 @@
+"""`relight plan`: what a fit would do, as a table."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from relight.commands.arguments import add_forced, add_session
+
+if TYPE_CHECKING:
+    from relight.plan import Plan
+
+EXAMPLE = "relight plan S --force room_shading=run"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The flags of `relight plan`."""
+    add_session(parser)
+    add_forced(parser)
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the plan as JSON too")
+
+
+def run(args: argparse.Namespace) -> None:
+    """Prints the plan; a session that cannot be fitted is an error after its table."""
+    from capture.atomic import atomic_write
+    from capture.session import Session
+    from relight.plan import make_plan, parse_forced
+
+    plan = make_plan(Session.open(args.session), parse_forced(args.force))
+    print_plan(plan)
+    if args.json:
+        atomic_write(args.json, (json.dumps(plan.as_json(), indent=2) + "\n").encode())
+    plan.check()
+
+
+def print_plan(plan: Plan) -> None:
+    """Prints the decisions and how long the fit should take."""
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(box=None, pad_edge=False)
+    for head in ("step", "", "why", "saves"):
+        table.add_column(head, style="dim" if head == "saves" else None)
+    for decision in plan.decisions:
+        action = f"{decision.action.value} (forced)" if decision.forced else decision.action.value
+        table.add_row(decision.name, action, decision.reason, decision.saving)
+    console = Console()
+    console.print(table)
+    console.print(f"estimated time on two cores: {plan.estimated_s:.0f} s")

@@ -1,0 +1,29 @@
+"""Errors of fitting, lighting and measuring, under `capture.errors.RelightError`.
+
+RelightError
+├── LightError       a light, its description or its panorama cannot be used
+├── PlanError        a session cannot be fitted as it is, or a decision cannot be forced
+├── PortraitError    a portrait is missing or cannot be read
+└── TruthError       a folder with ground truth cannot be used
+
+Every message is one sentence for the user: what is wrong, with its name, value and limit, and what to do
+next.
+"""
+
+from capture.errors import RelightError
+
+
+class LightError(RelightError):
+    """A light, its description or its panorama cannot be used."""
+
+
+class PlanError(RelightError):
+    """A session cannot be fitted as it is, or a decision of its plan cannot be forced."""
+
+
+class PortraitError(RelightError):
+    """A portrait is missing or cannot be read."""
+
+
+class TruthError(RelightError):
+    """A folder with ground truth cannot be used."""
