@@ -14,8 +14,8 @@ A cameras.json object:
     frames: [{index, file, mask, linear, flash 1|0|null, split "train"|"val", pts_s, flash_position [3],
               R [3][3] and t [3], or cam_from_world [4][4] or [3][4]}]
 
-Only the pose of a frame is required where the shared fields are there. Unknown keys are ignored: measured truth
-(light colours, albedo) lives beside the inputs in such files and is no business of a reader of cameras.
+Only the pose of a frame is required where the shared fields are there. Unknown keys are ignored: measured
+truth (light colours, albedo) lives beside the inputs in such files and is no business of a reader of cameras.
 """
 
 from __future__ import annotations

@@ -40,7 +40,7 @@ _MODEL_NAMES = (
     "RAD_TAN_THIN_PRISM_FISHEYE",
 )
 
-# Of the models that we can express: number of focal lengths, and where their distortion goes in OpenCV's order.
+# Of the models that we can express: number of focal lengths, and where the distortion goes in OpenCV's order.
 _FOCALS_AND_DISTORTION: dict[str, tuple[int, tuple[int, ...]]] = {
     "SIMPLE_PINHOLE": (1, ()),
     "PINHOLE": (2, ()),
@@ -359,7 +359,7 @@ class _Reader:
         left = len(self.data) - self.position
         if size > left:
             raise SourceError(
-                f"{self.path} is damaged or cut short: {size} bytes are needed at {self.position}, {left} are left."
+                f"{self.path} is damaged or cut short: at byte {self.position}, {size} are needed and {left} left."
             )
 
 

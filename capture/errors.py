@@ -10,8 +10,8 @@
         ├── TaggingError     the flash state of the frames cannot be told
         └── DeviceError      a camera or flash that does not answer as it must
 
-Every message is one sentence for the user: what is wrong, with its name, value and limit, and what to do next.
-Commands print it and exit with code 1.
+Every message is one sentence for the user: what is wrong, with its name, value and limit, and what to do
+next. Commands print it and exit with code 1.
 """
 
 

@@ -1,8 +1,8 @@
 """Strict reading of JSON from outside: every value is checked and every complaint names its place.
 
-`read_json` parses a file; `Fields` reads one object of it. Both raise the error class they are given, so that a
-malformed cameras.json is a SourceError and a malformed session.json a SessionError. NaN and infinite numbers are
-refused.
+`read_json` parses a file; `Fields` reads one object of it. Both raise the error class they are given, so that
+a malformed cameras.json is a SourceError and a malformed session.json a SessionError. NaN and infinite
+numbers are refused.
 """
 
 from __future__ import annotations

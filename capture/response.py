@@ -2,8 +2,8 @@
 
 The form in calibration.json, under "response":
 
-    {"transfer": "srgb", ...}                                     a named curve
-    {"table": {"stored": [n], "linear": [n] or [n][3]}, ...}      measured: rising pairs, stored 0..1, 1.0 = white clip
+    {"transfer": "srgb", "source": ...}                                a named curve
+    {"table": {"stored": [n], "linear": [n] or [n][3]}, "source": ...} measured, stored 0..1, 1.0 = white clip
 """
 
 from __future__ import annotations
@@ -15,8 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from capture.errors import CalibrationError, TransferError
-from capture.json_fields import Fields, read_json
+from capture.calibration_file import read_calibration_entries
+from capture.errors import TransferError
+from capture.json_fields import Fields
 from capture.transfer import canonical_transfer, to_linear
 
 
@@ -28,11 +29,13 @@ class Response:
         transfer: a name of `capture.transfer`; None = `stored` and `linear` count.
         stored: [n] stored values 0..1, rising.
         linear: [n] or [n, 3] (R, G, B) radiance at these, never falling, 1.0 = white clip.
+        source: where it comes from.
     """
 
     transfer: str | None
     stored: NDArray[np.float64] | None = None
     linear: NDArray[np.float64] | None = None
+    source: str = ""
 
     def __post_init__(self) -> None:
         """Checks the values.
@@ -86,6 +89,13 @@ class Response:
                 radiance[..., channel] = np.interp(plane, self.stored, channels[:, channel])
         return radiance
 
+    def to_json(self) -> dict[str, Any]:
+        """The entry of calibration.json."""
+        if self.stored is None or self.linear is None:
+            return {"transfer": self.transfer, "source": self.source}
+        table = {"stored": self.stored.tolist(), "linear": self.linear.tolist()}
+        return {"table": table, "source": self.source}
+
 
 def load_response(calibration: Path) -> Response | None:
     """The response of a calibration.json; None where there is no file or no response in it.
@@ -95,18 +105,20 @@ def load_response(calibration: Path) -> Response | None:
     """
     if not calibration.is_file():
         return None
-    entry = read_json(calibration, CalibrationError).child("response", None)
+    entry = read_calibration_entries(calibration).child("response", None)
     return None if entry is None else response_from_json(entry)
 
 
 def response_from_json(entry: Fields) -> Response:
     """The response that a "response" entry describes."""
     try:
+        source = entry.text("source", "")
         if (table := entry.child("table", None)) is None:
-            return Response(canonical_transfer(entry.text("transfer")))
-        wide = isinstance(next(iter(table.values.get("linear") or [None])), list)
+            return Response(canonical_transfer(entry.text("transfer")), source=source)
+        column = table.values.get("linear")
+        wide = isinstance(column, list) and column and isinstance(column[0], list)
         linear = table.array("linear", (None, 3) if wide else (None,))
-        return Response(None, table.array("stored", (None,)), linear)
+        return Response(None, table.array("stored", (None,)), linear, source)
     except TransferError as cause:
         raise entry.fail(str(cause)) from cause
     except ValueError as cause:

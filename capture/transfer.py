@@ -9,9 +9,9 @@ A name is one of
     log:A               encoded = log(1 + A linear) / log(1 + A)
     jtvideo, jtlog, jtlog2   the tabulated profiles of the Open Camera app, piecewise linear
 
-`gamma` and `log` take an optional `@N`: the curve as a camera applies it that was given N evenly spaced control
-points and interpolates linearly between them (Android's TONEMAP_CURVE). Open Camera sends 64 points, 32 on
-Samsung phones; at the dark end of a strong log profile the difference is large.
+`gamma` and `log` take an optional `@N`: the curve as a camera applies it that was given N evenly spaced
+control points and interpolates linearly between them (Android's TONEMAP_CURVE). Open Camera sends 64 points,
+32 on Samsung phones; at the dark end of a strong log profile the difference is large.
 
 1.0 is the white clip of the stored frame on both sides.
 """
@@ -29,8 +29,8 @@ from capture.errors import TransferError
 
 Curve = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
-# ITU-R BT.2020-2, table 4: alpha and beta solve "value and slope agree at the knee"; BT.709 prints them rounded
-# (1.099, 0.018), which leaves a step of 2.5e-4 there.
+# ITU-R BT.2020-2, table 4: alpha and beta solve "value and slope agree at the knee"; BT.709 prints them
+# rounded (1.099, 0.018), which leaves a step of 2.5e-4 there.
 _ALPHA_709 = 1.09929682680944
 _BETA_709 = 0.018053968510807
 
@@ -110,8 +110,9 @@ def to_linear(values: ArrayLike, transfer: str) -> NDArray[np.float32]:
     """Linear radiance of stored values.
 
     Args:
-        values: any shape; unsigned integers are scaled by the largest value of their type, floats are taken as
-            0..1. Negative floats become 0; floats above 1 follow the curve on (a tabulated curve ends at 1).
+        values: any shape; unsigned integers are scaled by the largest value of their type, floats are taken
+            as 0..1. Negative floats become 0; floats above 1 follow the curve on (a tabulated curve ends at
+            1).
         transfer: a name of this module's list.
 
     Returns:
