@@ -359,7 +359,8 @@ class _Reader:
         left = len(self.data) - self.position
         if size > left:
             raise SourceError(
-                f"{self.path} is damaged or cut short: at byte {self.position}, {size} are needed and {left} left."
+                f"{self.path} is damaged or cut short: {size} bytes should follow byte {self.position}, "
+                f"{left} do."
             )
 
 

@@ -14,7 +14,6 @@ before `append_frame` returns. So a power cut costs at most the frame in hand.
 
 from __future__ import annotations
 
-import json
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -27,25 +26,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capture.atomic import atomic_write
-from capture.cameras import LARGEST_SIDE, Camera
+from capture.cameras import Camera
 from capture.colmap_model import read_colmap_model, write_colmap_model
-from capture.errors import ImageError, SessionError, TransferError
+from capture.errors import ImageError, SessionError
 from capture.frame_log import FrameLog
 from capture.frame_record import EXCLUDING_REASONS as EXCLUDING_REASONS
 from capture.frame_record import FrameRecord as FrameRecord
 from capture.images import read_image, write_image
-from capture.json_fields import Fields, read_json
 from capture.response import Response, load_response
+from capture.session_manifest import RESERVED_KEYS, ROTATIONS_DEG, STATUSES, read_manifest, write_manifest
 from capture.transfer import canonical_transfer
 
 logger = logging.getLogger(__name__)
-
-SCHEMA = "relight-session"
-SCHEMA_VERSION = 1
-STATUSES = ("recording", "complete", "interrupted")
-ROTATIONS_DEG = (0, 90, 180, 270)
-
-_MANIFEST_KEYS = ("schema", "version", "status")
 
 
 class Session:
@@ -145,8 +137,7 @@ class Session:
             raise SessionError(
                 f"{path} is no session (it has no session.json); make one with `relight import`."
             )
-        manifest = read_json(path / "session.json", SessionError)
-        session = cls(path, _checked_status(manifest), _checked_info(manifest))
+        session = cls(path, *read_manifest(path / "session.json"))
         for number, record in session._log.read():
             if complaint := session._complaint(record):
                 raise SessionError(f"{path / 'frames.jsonl'}, line {number}: {complaint}.")
@@ -228,7 +219,7 @@ class Session:
 
     def update_info(self, **entries: Any) -> None:
         """Sets entries of session.json, such as a report of the tagging, and writes it."""
-        if reserved := sorted(entries.keys() & set(_MANIFEST_KEYS)):
+        if reserved := sorted(entries.keys() & RESERVED_KEYS):
             raise ValueError(f"{reserved[0]} is not an entry to set")
         self.info.update(entries)
         self._write_manifest()
@@ -258,16 +249,16 @@ class Session:
         height, width = image.shape[:2]
         if (width, height) != (record.width, record.height):
             raise SessionError(
-                f"{self.path}: frame {record.index} ({record.file}) is {width} x {height} pixels, its record says "
-                f"{record.width} x {record.height}; put the original picture back."
+                f"{self.path}: frame {record.index} ({record.file}) is {width} x {height} pixels, its record "
+                f"says {record.width} x {record.height}; put the original picture back."
             )
         return image
 
     def load_radiance(self, record: FrameRecord) -> NDArray[np.float32]:
         """A frame in linear radiance: [H, W, 3], 1.0 = white clip.
 
-        Integer pixels go through the response of calibration.json where there is one, else through the session's
-        transfer function. Float pixels (EXR, HDR) are radiance already.
+        Integer pixels go through the response of calibration.json where there is one, else through the
+        session's transfer function. Float pixels (EXR, HDR) are radiance already.
         """
         image = self.load_image(record)
         if image.ndim == 2:
@@ -346,8 +337,8 @@ class Session:
             record = self._by_file.get(name)
             if record is None or (camera.width, camera.height) != (record.width, record.height):
                 raise SessionError(
-                    f"{self.cameras_dir}: the camera of {name!r} ({camera.width} x {camera.height} pixels) fits no "
-                    "frame of the session; delete the folder and find the poses again."
+                    f"{self.cameras_dir}: the camera of {name!r} ({camera.width} x {camera.height} pixels) fits "
+                    "no frame of the session; delete the folder and find the poses again."
                 )
             cameras[record.index] = replace(camera, flash=record.flash)
         return cameras
@@ -381,52 +372,4 @@ class Session:
         logger.warning("%s: %s", self.path, sentence)
 
     def _write_manifest(self) -> None:
-        manifest = {"schema": SCHEMA, "version": SCHEMA_VERSION, "status": self.status, **self.info}
-        try:
-            content = json.dumps(manifest, indent=2, ensure_ascii=False, allow_nan=False)
-            atomic_write(self.path / "session.json", content.encode() + b"\n")
-        except (TypeError, ValueError) as cause:
-            raise SessionError(f"{self.path}: session.json cannot hold these entries: {cause}.") from cause
-        except OSError as cause:
-            raise SessionError(
-                f"{self.path}: session.json cannot be written: {cause.strerror or cause}."
-            ) from cause
-
-
-def _checked_status(manifest: Fields) -> str:
-    """Status of a manifest whose schema is ours."""
-    schema = manifest.text("schema", "")
-    if schema != SCHEMA:
-        raise manifest.fail(f"the schema is {schema!r}, not {SCHEMA!r}; this is no session of this program.")
-    version = manifest.integer("version", low=1)
-    if version > SCHEMA_VERSION:
-        raise manifest.fail(
-            f"it was written by a newer program (schema version {version}; this one knows {SCHEMA_VERSION}); "
-            "update the program."
-        )
-    status: str = manifest.text("status")
-    if status not in STATUSES:
-        raise manifest.fail(f"the status is {status!r}, not one of {', '.join(STATUSES)}.")
-    return status
-
-
-def _checked_info(manifest: Fields) -> dict[str, Any]:
-    """The other entries of a manifest, those of the image checked."""
-    manifest.child("source")
-    image = manifest.child("image")
-    rotation_deg = image.integer("rotation_deg", 0)
-    if rotation_deg not in ROTATIONS_DEG:
-        raise image.fail(f'"rotation_deg" is {rotation_deg}, not 0, 90, 180 or 270.')
-    try:
-        transfer = canonical_transfer(image.text("transfer"))
-    except TransferError as cause:
-        raise image.fail(str(cause)) from cause
-    info = {key: value for key, value in manifest.values.items() if key not in _MANIFEST_KEYS}
-    info["image"] = {
-        **image.values,
-        "width": image.integer("width", low=1, high=LARGEST_SIDE),
-        "height": image.integer("height", low=1, high=LARGEST_SIDE),
-        "transfer": transfer,
-        "rotation_deg": rotation_deg,
-    }
-    return info
+        write_manifest(self.path / "session.json", self.status, self.info)
