@@ -77,9 +77,9 @@ class _Version(argparse.Action):
         super().__init__(option_strings, argparse.SUPPRESS, nargs=0, help="show the version and exit")
 
     def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
-        from importlib.metadata import version
+        from relight.version import installed_version
 
-        print(version("relightable-portrait-rig"))
+        print(installed_version())
         parser.exit()
 
 

@@ -24,7 +24,8 @@ import numpy as np
 
 from capture.cameras import Camera
 from capture.ply import PointCloud, read_ply
-from capture.session import EXCLUDING_REASONS, FrameRecord, Session
+from capture.frame_record import EXCLUDING_REASONS, FrameRecord
+from capture.session import Session
 from relight.errors import PlanError
 from relight.view_redundancy import redundant_views
 

@@ -9,7 +9,8 @@ import pytest
 from capture.cameras import Camera
 from capture.images import write_png
 from capture.ply import PointCloud, write_ply
-from capture.session import FrameRecord, Session
+from capture.frame_record import FrameRecord
+from capture.session import Session
 from relight.errors import PlanError
 from relight.plan import Action, make_plan, parse_forced
 from relight.view_redundancy import ENOUGH_REPEATS
