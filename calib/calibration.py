@@ -166,7 +166,7 @@ def load_calibration(path: Path) -> Calibration:
 
 
 def save_calibration(calibration: Calibration, path: Path) -> None:
-    """Writes what is known to a calibration.json; entries that are not known are left as they are in the file.
+    """Writes what is known to a calibration.json; other entries of the file stay as they are.
 
     Raises:
         CalibrationError: the file is there but malformed; or a value is not possible.

@@ -337,8 +337,8 @@ class Session:
             record = self._by_file.get(name)
             if record is None or (camera.width, camera.height) != (record.width, record.height):
                 raise SessionError(
-                    f"{self.cameras_dir}: the camera of {name!r} ({camera.width} x {camera.height} pixels) fits "
-                    "no frame of the session; delete the folder and find the poses again."
+                    f"{self.cameras_dir}: the camera of {name!r} ({camera.width} x {camera.height} pixels) "
+                    "fits no frame of the session; delete the folder and find the poses again."
                 )
             cameras[record.index] = replace(camera, flash=record.flash)
         return cameras

@@ -1,0 +1,79 @@
+"""Posed image sets: a cameras.json beside pictures, and points.ply and masks where there are any.
+
+Inputs only: light colours, linear pictures, albedo and normals that such a folder may hold are truth for
+measuring, and nothing of them enters the session. Of the flash only its position is taken, which a person can
+measure with a ruler.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from capture.calibration_file import Quantity, write_calibration_entries
+from capture.cameras import PosedSet, load_posed_set
+from capture.errors import SourceError
+from capture.importers.flash_list import read_flash_list
+from capture.importers.image_set import SourceFrame, named_masks, write_image_set
+from capture.importers.options import ImportOptions, Progress
+from capture.session import Session
+
+
+def import_posed(path: Path, out: Path, options: ImportOptions, progress: Progress) -> Session:
+    """Makes a session of a cameras.json (or its folder).
+
+    Raises:
+        SourceError: the file is malformed, or a picture, mask or cloud is missing or does not fit.
+    """
+    posed_set = load_posed_set(path)
+    names = [_name(frame.file, posed_set.root, frame.camera.name) for frame in posed_set.frames]
+    flags = [frame.flash for frame in posed_set.frames]
+    if options.flash_list is not None:
+        flags = read_flash_list(options.flash_list, names)
+    masks = named_masks(options.masks, names)
+    frames = [
+        SourceFrame(
+            index=frame.index,
+            name=name,
+            picture=frame.file,
+            camera=frame.camera,
+            flash=flag,
+            split=frame.split,
+            mask=masks.get(name, frame.mask),
+            pts_s=frame.pts_s,
+        )
+        for frame, name, flag in zip(posed_set.frames, names, flags, strict=True)
+    ]
+    session = write_image_set(
+        out,
+        frames,
+        source={"kind": "posed", "path": str(path), "name": posed_set.name, "units": posed_set.units},
+        transfer=options.transfer or posed_set.transfer,
+        cloud=_cloud(posed_set.root, options),
+        progress=progress,
+    )
+    _save_flash_offset(posed_set, session)
+    session.finish()
+    return session
+
+
+def _name(file: Path | None, root: Path, camera_name: str) -> str:
+    if file is None:
+        return camera_name
+    return (file.relative_to(root) if file.is_relative_to(root) else file).as_posix()
+
+
+def _cloud(root: Path, options: ImportOptions) -> Path | None:
+    own = root / "points.ply"
+    return options.points or (own if own.is_file() else None)
+
+
+def _save_flash_offset(posed_set: PosedSet, session: Session) -> None:
+    offset = posed_set.flash_offset_cam_m
+    if offset is None:
+        return
+    if posed_set.units != "metres":
+        raise SourceError(
+            f"{posed_set.root}: a flash position needs poses in metres, not in arbitrary units."
+        )
+    quantity = Quantity.of(offset, "m", f"stated by the cameras.json of {posed_set.name!r}")
+    write_calibration_entries(session.calibration_path, {"flash_offset_cam_m": quantity.to_json()})
