@@ -1,0 +1,1 @@
+"""From a session to a relightable portrait: fitting, lights, rendering and measures."""
