@@ -1,0 +1,142 @@
+"""What a light falls on: the points of some maps that are worth shading, with what they see of a light.
+
+Outside the domain: a zero normal marks a point without a known surface, and its cosine with any light is
+zero. Within `MIN_DISTANCE_M` of a point light 1/d^2 stops growing and the cosine falls to zero, so values and
+gradients are finite even at d = 0. NaN stays in its own point.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike
+from torch import Tensor
+
+# Nearer than this, a light counts as this far: no real lamp is a point, and 1/d^2 would have no bound.
+MIN_DISTANCE_M = 1e-3
+
+
+class SurfaceMaps(Protocol):
+    """What can be shaded: maps of a view, [...] = [H, W], or arrays of points, [...] = [P]."""
+
+    @property
+    def albedo(self) -> Tensor:
+        """[..., 3], linear, 0..1."""
+
+    @property
+    def normals_world(self) -> Tensor:
+        """[..., 3], unit, or 0 where no surface is known."""
+
+    @property
+    def shading(self) -> Tensor:
+        """[...], room shading, relative to C_room."""
+
+    @property
+    def mask(self) -> Tensor:
+        """[...], 0..1; only where it is above 0 is anything shaded."""
+
+    @property
+    def points_world(self) -> Tensor:
+        """[..., 3], metres."""
+
+
+class Visibility(Protocol):
+    """How much of a light each pixel of the maps sees, 0..1, from the geometry."""
+
+    def point(self, position_world: Tensor) -> Tensor:
+        """[...] for a light at a position [3], metres."""
+
+    def directional(self, to_light: Tensor) -> Tensor:
+        """[...] for a distant light, unit direction [3]."""
+
+    def environment(self, directions: Tensor) -> Tensor | None:
+        """[K, ...] for distant lights, unit directions [K, 3]; None where that is not offered."""
+
+
+class Surface:
+    """The P points of some maps where the mask is above 0, gathered when first asked for."""
+
+    def __init__(self, maps: SurfaceMaps, visibility: Visibility | None = None) -> None:
+        self._maps = maps
+        self._visibility = visibility
+        self._selected = (maps.mask.reshape(-1) > 0).nonzero()[:, 0]
+
+    def __len__(self) -> int:
+        return len(self._selected)
+
+    @cached_property
+    def albedo(self) -> Tensor:
+        """[P, 3], linear, 0..1."""
+        return self._gather(self._maps.albedo)
+
+    @cached_property
+    def normals(self) -> Tensor:
+        """[P, 3], unit or 0, world."""
+        return self._gather(self._maps.normals_world)
+
+    @cached_property
+    def shading(self) -> Tensor:
+        """[P, 1], room shading, relative to C_room."""
+        return self._gather(self._maps.shading[..., None])
+
+    @cached_property
+    def points(self) -> Tensor:
+        """[P, 3], metres, world."""
+        return self._gather(self._maps.points_world)
+
+    def vector(self, value: ArrayLike | Tensor) -> Tensor:
+        """A value as a tensor of the surface's type, on its device."""
+        return (value if isinstance(value, Tensor) else torch.tensor(np.asarray(value))).to(self._maps.albedo)
+
+    def sees_point(self, position_world: Tensor) -> Tensor | float:
+        """[P], how much of a point light is seen; 1 without a visibility."""
+        if self._visibility is None:
+            return 1.0
+        return self._gather_visible(self._visibility.point(position_world)[None])[0]
+
+    def sees_direction(self, to_light: Tensor) -> Tensor | float:
+        """[P], how much of a distant light is seen; 1 without a visibility."""
+        if self._visibility is None:
+            return 1.0
+        return self._gather_visible(self._visibility.directional(to_light)[None])[0]
+
+    def sees_directions(self, directions: Tensor) -> Tensor | None:
+        """[K, P], how much of each distant light is seen; None without a visibility that offers it."""
+        visible = None if self._visibility is None else self._visibility.environment(directions)
+        return None if visible is None else self._gather_visible(visible)
+
+    def scatter(self, values: Tensor) -> Tensor:
+        """Values [P, C] of the points back in the maps' shape, [..., C], 0 elsewhere."""
+        mask = self._maps.mask
+        everywhere = values.new_zeros(mask.numel(), values.shape[-1])
+        return everywhere.index_copy(0, self._selected, values).reshape(*mask.shape, -1)
+
+    def _gather(self, values: Tensor) -> Tensor:
+        return values.reshape(-1, values.shape[-1]).index_select(0, self._selected)
+
+    def _gather_visible(self, visible: Tensor) -> Tensor:
+        return visible.reshape(len(visible), -1).index_select(1, self._selected).to(self._maps.albedo)
+
+
+def cosine(normals: Tensor, to_light: Tensor) -> Tensor:
+    """Lambert's max(0, <n, l>): [...] of normals [..., 3] and a unit direction [3] towards the light."""
+    return (normals @ to_light).clamp(min=0.0)
+
+
+def cosine_falloff(points: Tensor, normals: Tensor, position: Tensor) -> Tensor:
+    """max(0, <n, l>) / d^2 under a point light, per square metre (Sevastopolsky 2020, eq. 5).
+
+    Args:
+        points: [..., 3], metres.
+        normals: [..., 3], unit or 0, in the axes of `points`.
+        position: [3], of the light, metres.
+
+    Returns:
+        [...], finite everywhere.
+    """
+    towards = position - points
+    distance_squared = (towards * towards).sum(dim=-1).clamp(min=MIN_DISTANCE_M**2)
+    return (normals * towards).sum(dim=-1).clamp(min=0.0) / distance_squared**1.5
