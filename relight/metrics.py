@@ -59,7 +59,7 @@ def ssim(picture: Picture, truth: Picture, region: Region) -> float:
 
 def _windowed(image: NDArray[np.float64]) -> NDArray[np.float64]:
     mean = cv2.blur(image, (_SSIM_WINDOW_PX, _SSIM_WINDOW_PX), borderType=cv2.BORDER_REFLECT)
-    return mean.reshape(image.shape)  # OpenCV drops a last axis of one
+    return np.asarray(mean, np.float64).reshape(image.shape)  # OpenCV drops a last axis of one
 
 
 def channel_scales(values: Picture, truth: Picture) -> NDArray[np.float64]:
@@ -117,8 +117,8 @@ def alpha_error(mask: Picture, truth: Picture, band_px: float = 10.0) -> float:
 def silhouette_f_score(mask: Picture, truth: Picture, tolerance_px: float = 1.5) -> float:
     """Harmonic mean of the shares of either silhouette that lie within a tolerance of the other.
 
-    Unlike the IoU it sees strands of hair: it counts length, not area (the boundary measure F of Perazzi 2016,
-    with exact distances). 0 when only one of the masks [H, W] has a silhouette, NaN when none has.
+    Unlike the IoU it sees strands of hair: it counts length, not area (the boundary measure F of Perazzi
+    2016, with exact distances). 0 when only one of the masks [H, W] has a silhouette, NaN when none has.
     """
     found, wanted = _silhouette(mask), _silhouette(truth)
     if not (found.any() and wanted.any()):
