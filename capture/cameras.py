@@ -263,13 +263,10 @@ def _distortion(fields: Fields) -> NDArray[np.float64]:
 
 
 def _pose(entry: Fields) -> NDArray[np.float64]:
-    cam_from_world = np.eye(4)
     if "cam_from_world" in entry:
-        rows = 4 if len(entry.values["cam_from_world"]) == 4 else 3
-        cam_from_world[:rows] = entry.array("cam_from_world", (rows, 4))
-        if not np.array_equal(cam_from_world[3], [0, 0, 0, 1]):
-            raise entry.fail("the last row of cam_from_world must be 0 0 0 1.")
+        cam_from_world = entry.affine("cam_from_world")
     else:
+        cam_from_world = np.eye(4)
         cam_from_world[:3, :3] = entry.array("R", (3, 3))
         cam_from_world[:3, 3] = entry.array("t", (3,))
     if complaint := check_rotation(cam_from_world[:3, :3]):

@@ -128,6 +128,16 @@ class Fields:
             raise self.fail(f'"{key}" contains a value that is not a finite number.')
         return array
 
+    def affine(self, key: str) -> NDArray[np.float64]:
+        """[4, 4] of a matrix of 3 or 4 rows, the last of which is 0 0 0 1."""
+        rows = self._get(key, _REQUIRED)
+        count = 3 if isinstance(rows, list) and len(rows) == 3 else 4
+        matrix = np.eye(4)
+        matrix[:count] = self.array(key, (count, 4))
+        if not np.array_equal(matrix[3], [0, 0, 0, 1]):
+            raise self.fail(f'the last row of "{key}" must be 0 0 0 1.')
+        return matrix
+
     def child(self, key: str, default: Any = _REQUIRED) -> Any:
         """A nested object as Fields; `default` when absent or null."""
         value = self._get(key, default)

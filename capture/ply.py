@@ -7,7 +7,6 @@ besides x, y, z, nx, ny, nz and red, green, blue. Later elements (faces, with th
 from __future__ import annotations
 
 from dataclasses import dataclass
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -166,17 +165,16 @@ def _ascii_table(data: bytes, body: int, count: int, properties: dict[str, str],
         raise SourceError(
             f"{path} is cut short: its header promises {count} points, more than the file can hold."
         )
-    try:
-        numbers = np.loadtxt(BytesIO(data[body:]), np.float64, max_rows=count, ndmin=2, comments=None)
-    except ValueError as cause:
+    size = count * len(properties)
+    words = data[body:].split(None, size)[:size]
+    if len(words) < size:
         raise SourceError(
-            f"{path}: the points cannot be read as numbers: {str(cause).splitlines()[0]}."
-        ) from cause
-    if numbers.shape != (count, len(properties)):
-        raise SourceError(
-            f"{path}: the header promises {count} points of {len(properties)} values, the file holds "
-            f"{numbers.shape[0]} of {numbers.shape[1]}."
+            f"{path} is cut short: its header promises {count} points, the file ends before them."
         )
+    try:
+        numbers = np.array(words).astype(np.float64).reshape(count, len(properties))
+    except ValueError as cause:
+        raise SourceError(f"{path}: the points cannot be read as numbers: {cause}.") from cause
     table = np.empty(count, np.dtype(list(properties.items())))
     with np.errstate(invalid="ignore", over="ignore"):
         for i, name in enumerate(properties):

@@ -72,7 +72,6 @@ _ALIASES = {
     "rec709": "rec709",
     "bt709": "rec709",
     "linear": "linear",
-    "none": "linear",
     "jtvideo": "jtvideo",
     "jtlog": "jtlog",
     "jtlog2": "jtlog2",

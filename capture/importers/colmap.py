@@ -55,7 +55,7 @@ def import_colmap(model: Path, out: Path, options: ImportOptions, progress: Prog
         SourceFrame(index, name, images / name, reconstruction.cameras[name], flag, mask=masks.get(name))
         for index, (name, flag) in enumerate(zip(names, flags, strict=True))
     ]
-    session = write_image_set(
+    return write_image_set(
         out,
         frames,
         source={"kind": "colmap", "path": str(model), "units": "arbitrary"},
@@ -63,8 +63,6 @@ def import_colmap(model: Path, out: Path, options: ImportOptions, progress: Prog
         cloud=options.points or _cloud(roots, reconstruction.points),
         progress=progress,
     )
-    session.finish()
-    return session
 
 
 def _size_of_images(model: Path) -> int:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from capture.atomic import atomic_write
+from capture.calibration_file import Quantity, write_calibration_entries
 from capture.cameras import Camera
 from capture.errors import ImageError, SourceError
 from capture.images import IMAGE_SUFFIXES, image_size, read_image, write_png
@@ -55,8 +56,9 @@ def write_image_set(
     transfer: str,
     cloud: Path | PointCloud | None,
     progress: Progress,
+    calibration: Mapping[str, Quantity] | None = None,
 ) -> Session:
-    """Makes a session, left open for the importer to finish.
+    """Makes a complete session of frames, a cloud and what is known of the flash.
 
     Pictures are copied byte for byte. Everything is checked before the first file is written. An interrupted
     session of the same source is completed.
@@ -76,19 +78,23 @@ def write_image_set(
     masks = _existing_masks(with_pictures)
 
     first = with_pictures[0].camera
-    session = _open_or_create(out, source, first.width, first.height, transfer)
-    present = {record.index for record in session.frames}
-    for done, frame in enumerate(frames):
-        if frame.index not in present:
-            session.append_frame(_copy(frame, session))
-        if (mask := masks.get(frame.index)) is not None:
-            _copy_mask(mask, frame, session)
-        progress("copying pictures", (done + 1) / len(frames))
-    session.save_scene_cameras({frame.index: frame.camera for frame in with_pictures})
-    if isinstance(cloud, Path):
-        atomic_write(session.points_path, cloud.read_bytes())
-    elif points is not None:
-        write_ply(session.points_path, points)
+    with _open_or_create(out, source, first.width, first.height, transfer) as session:
+        present = {record.index for record in session.frames}
+        for done, frame in enumerate(frames):
+            if frame.index not in present:
+                session.append_frame(_copy(frame, session))
+            if (mask := masks.get(frame.index)) is not None:
+                _copy_mask(mask, frame, session)
+            progress("copying pictures", (done + 1) / len(frames))
+        session.save_scene_cameras({frame.index: frame.camera for frame in with_pictures})
+        if isinstance(cloud, Path):
+            atomic_write(session.points_path, cloud.read_bytes())
+        elif points is not None:
+            write_ply(session.points_path, points)
+        if calibration:
+            entries = {name: quantity.to_json() for name, quantity in calibration.items()}
+            write_calibration_entries(session.calibration_path, entries)
+        session.finish()
     return session
 
 
@@ -142,7 +148,8 @@ def _check_picture(frame: SourceFrame) -> None:
     if (width, height) != (camera.width, camera.height):
         raise SourceError(
             f"Frame {frame.index} ({picture}) is {width} x {height} pixels, its camera says "
-            f"{camera.width} x {camera.height}; use the pictures that the cameras were computed from, unrotated and in full size."
+            f"{camera.width} x {camera.height}; use the pictures that the cameras were "
+            "computed from, unrotated and in full size."
         )
 
 

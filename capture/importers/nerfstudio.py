@@ -63,7 +63,7 @@ def import_nerfstudio(path: Path, out: Path, options: ImportOptions, progress: P
                 mask=masks.get(name, path.parent / mask if mask else None),
             )
         )
-    session = write_image_set(
+    return write_image_set(
         out,
         frames,
         source={"kind": "nerfstudio", "path": str(path), "units": "arbitrary"},
@@ -71,8 +71,6 @@ def import_nerfstudio(path: Path, out: Path, options: ImportOptions, progress: P
         cloud=options.points or _cloud(fields, path.parent, file_from_original),
         progress=progress,
     )
-    session.finish()
-    return session
 
 
 def _file_name(entry: Fields, root: Path) -> str:
@@ -137,7 +135,7 @@ def _distortion(fields: Fields) -> NDArray[np.float64]:
 
 
 def _pose(entry: Fields, file_from_original: NDArray[np.float64]) -> NDArray[np.float64]:
-    world_from_gl = _affine(entry, "transform_matrix")
+    world_from_gl = entry.affine("transform_matrix")
     if complaint := check_rotation(world_from_gl[:3, :3]):
         raise entry.fail(f"{complaint}.")
     world_from_gl[:3, :3] = nearest_rotation(world_from_gl[:3, :3])
@@ -150,24 +148,13 @@ def _pose(entry: Fields, file_from_original: NDArray[np.float64]) -> NDArray[np.
 
 def _file_from_original(fields: Fields) -> NDArray[np.float64]:
     """[4, 4] similarity from the original reconstruction's world to the file's."""
-    matrix = _affine(fields, "applied_transform") if "applied_transform" in fields else np.eye(4)
+    matrix = fields.affine("applied_transform") if "applied_transform" in fields else np.eye(4)
     matrix[:3] *= fields.number("applied_scale", 1.0)
     scale = np.cbrt(np.linalg.det(matrix[:3, :3]))
     if not scale > 1e-9 or check_rotation(matrix[:3, :3] / scale):
         raise fields.fail(
             "applied_transform and applied_scale must be a rotation, a positive scale and a shift."
         )
-    return matrix
-
-
-def _affine(fields: Fields, key: str) -> NDArray[np.float64]:
-    """[4, 4] of a [3, 4] or [4, 4] entry."""
-    rows = fields.values[key] if key in fields else None
-    matrix = np.eye(4)
-    count = 3 if isinstance(rows, list) and len(rows) == 3 else 4
-    matrix[:count] = fields.array(key, (count, 4))
-    if not np.array_equal(matrix[3], [0, 0, 0, 1]):
-        raise fields.fail(f"the last row of {key} must be 0 0 0 1.")
     return matrix
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from capture.calibration_file import Quantity, write_calibration_entries
+from capture.calibration_file import Quantity
 from capture.cameras import PosedSet, load_posed_set
 from capture.errors import SourceError
 from capture.importers.flash_list import read_flash_list
@@ -43,17 +43,15 @@ def import_posed(path: Path, out: Path, options: ImportOptions, progress: Progre
         )
         for frame, name, flag in zip(posed_set.frames, names, flags, strict=True)
     ]
-    session = write_image_set(
+    return write_image_set(
         out,
         frames,
         source={"kind": "posed", "path": str(path), "name": posed_set.name, "units": posed_set.units},
         transfer=options.transfer or posed_set.transfer,
         cloud=_cloud(posed_set.root, options),
         progress=progress,
+        calibration=_calibration(posed_set),
     )
-    _save_flash_offset(posed_set, session)
-    session.finish()
-    return session
 
 
 def _name(file: Path | None, root: Path, camera_name: str) -> str:
@@ -67,13 +65,15 @@ def _cloud(root: Path, options: ImportOptions) -> Path | None:
     return options.points or (own if own.is_file() else None)
 
 
-def _save_flash_offset(posed_set: PosedSet, session: Session) -> None:
+def _calibration(posed_set: PosedSet) -> dict[str, Quantity]:
+    """The position of the flash, where the set states it."""
     offset = posed_set.flash_offset_cam_m
     if offset is None:
-        return
+        return {}
     if posed_set.units != "metres":
         raise SourceError(
             f"{posed_set.root}: a flash position needs poses in metres, not in arbitrary units."
         )
-    quantity = Quantity.of(offset, "m", f"stated by the cameras.json of {posed_set.name!r}")
-    write_calibration_entries(session.calibration_path, {"flash_offset_cam_m": quantity.to_json()})
+    return {
+        "flash_offset_cam_m": Quantity.of(offset, "m", f"stated by the cameras.json of {posed_set.name!r}")
+    }
