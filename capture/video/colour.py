@@ -24,9 +24,8 @@ Pixels = NDArray[np.uint8] | NDArray[np.uint16]
 
 #: Luma weights (red, blue) of a matrix: ITU-R BT.601, BT.709, BT.2020.
 LUMA_WEIGHTS = {"bt601": (0.299, 0.114), "bt709": (0.2126, 0.0722), "bt2020": (0.2627, 0.0593)}
-SWSCALE_MATRIX = {"bt601": 5, "bt709": 1, "bt2020": 9}
-SWSCALE_RANGE = {"limited": 1, "full": 2}
-SWSCALE_EXACT = (
+_SWSCALE_MATRIX = {"bt601": 5, "bt709": 1, "bt2020": 9}
+_SWSCALE_EXACT = (
     Interpolation.BICUBIC
     | Interpolation.ACCURATE_RND
     | Interpolation.FULL_CHR_H_INT
@@ -152,6 +151,23 @@ def plane(frame: VideoFrame, index: int) -> Pixels:
     return rows.reshape(data.height, -1)[:, : data.width]
 
 
+def luma_levels(colour: VideoColour, bits: int) -> tuple[float, float]:
+    """Code values of black and white in the planes of `full_scale_planes`."""
+    zero, span, _, _ = _levels(colour.color_range, bits)
+    shift = 0 if bits == 8 else 16 - bits
+    return float(zero << shift), float((zero + span) << shift)
+
+
+def full_scale_planes(frame: VideoFrame) -> tuple[Pixels, Pixels, Pixels]:
+    """The Y', Cb and Cr planes, in code values; deeper than 8 bits they are shifted up to fill 16."""
+    depth = bit_depth(frame)
+    planes = (plane(frame, 0), plane(frame, 1), plane(frame, 2))
+    if depth in (8, 16):
+        return planes
+    luma, blue, red = (np.left_shift(samples, 16 - depth) for samples in planes)
+    return luma, blue, red
+
+
 def rgb_from_frame(
     frame: VideoFrame, colour: VideoColour, reformatter: VideoReformatter | None = None
 ) -> Pixels:
@@ -164,15 +180,15 @@ def rgb_from_frame(
     """
     if bit_depth(frame) > 8:
         return _rgb_from_deep_frame(frame, colour)
-    matrix = SWSCALE_MATRIX[colour.matrix]
+    matrix = _SWSCALE_MATRIX[colour.matrix]
     converted = (reformatter or VideoReformatter()).reformat(
         frame,
         format="rgb24",
         src_colorspace=matrix,
         dst_colorspace=matrix,
-        src_color_range=SWSCALE_RANGE[colour.color_range],
-        dst_color_range=SWSCALE_RANGE["full"],
-        interpolation=SWSCALE_EXACT,
+        src_color_range=RANGE_CODES[colour.color_range],
+        dst_color_range=RANGE_CODES["full"],
+        interpolation=_SWSCALE_EXACT,
         threads=1,
     )
     return np.asarray(converted.to_ndarray(), dtype=np.uint8)
@@ -181,15 +197,11 @@ def rgb_from_frame(
 def _rgb_from_deep_frame(frame: VideoFrame, colour: VideoColour) -> NDArray[np.uint16]:
     """R'G'B' by ITU-R BT.2020-2, tables 4 and 5 (BT.709 and BT.601 differ only in the weights)."""
     bits = bit_depth(frame)
-    step = 1 << (bits - 8)
-    if colour.color_range == "full":
-        luma_zero, luma_span, chroma_span = 0, (1 << bits) - 1, (1 << bits) - 1
-    else:
-        luma_zero, luma_span, chroma_span = 16 * step, 219 * step, 224 * step
+    luma_zero, luma_span, chroma_zero, chroma_span = _levels(colour.color_range, bits)
     luma = (plane(frame, 0).astype(np.float32) - luma_zero) / luma_span
     size = (frame.width, frame.height)
     blue_difference, red_difference = (
-        (_upsample_chroma(plane(frame, index), size) - 128 * step) / chroma_span for index in (1, 2)
+        (_upsample_chroma(plane(frame, index), size) - chroma_zero) / chroma_span for index in (1, 2)
     )
     red_weight, blue_weight = LUMA_WEIGHTS[colour.matrix]
     red = luma + 2.0 * (1.0 - red_weight) * red_difference
@@ -215,6 +227,47 @@ def _upsample_chroma(chroma: Pixels, size: tuple[int, int]) -> NDArray[np.float3
     return np.asarray(
         cv2.warpAffine(samples, chroma_from_luma, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
     )
+
+
+def fill_frame(frame: VideoFrame, rgb: NDArray[np.uint8], matrix: str, color_range: str) -> None:
+    """Writes R'G'B' [H, W, 3] into a yuv420p frame of 8 bits or more: the inverse of `rgb_from_frame`.
+
+    Computed in float32, because swscale rounds full-range chroma down and puts it between the columns, where
+    no decoder looks for it.
+    """
+    luma_zero, luma_span, chroma_zero, chroma_span = _levels(color_range, bit_depth(frame))
+    red, blue = LUMA_WEIGHTS[matrix]
+    luma = np.array([red, 1.0 - red - blue, blue])
+    blue_difference = (np.array([0.0, 0.0, 1.0]) - luma) / (2.0 * (1.0 - blue))
+    red_difference = (np.array([1.0, 0.0, 0.0]) - luma) / (2.0 * (1.0 - red))
+    spans = np.array([[luma_span], [chroma_span], [chroma_span]]) / 255.0
+    yuv_from_rgb = np.hstack(
+        [
+            spans * np.array([luma, blue_difference, red_difference]),
+            [[luma_zero], [chroma_zero], [chroma_zero]],
+        ]
+    )
+    planes = cv2.split(cv2.transform(rgb.astype(np.float32), yuv_from_rgb))
+    largest = (1 << bit_depth(frame)) - 1  # a full-range difference of +0.5 is one code beyond it
+    plane(frame, 0)[:] = np.rint(planes[0])
+    for index in (1, 2):
+        plane(frame, index)[:] = np.minimum(np.rint(_subsample_chroma(np.asarray(planes[index]))), largest)
+
+
+def _subsample_chroma(chroma: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Half of the rows and columns, sited left: on the even column (1 2 1), between two rows (1 1)."""
+    rows = 0.5 * (chroma[0::2] + chroma[1::2])
+    left = np.concatenate([rows[:, :1], rows[:, 1:-2:2]], axis=1)
+    subsampled: NDArray[np.float32] = 0.25 * (left + 2.0 * rows[:, 0::2] + rows[:, 1::2])
+    return subsampled
+
+
+def _levels(color_range: str, bits: int) -> tuple[int, int, int, int]:
+    """Luma's code of black and span to white, chroma's code of grey and span (BT.709-6, 4.6; H.273, 8.3)."""
+    step = 1 << (bits - 8)
+    if color_range == "full":
+        return 0, (1 << bits) - 1, 128 * step, (1 << bits) - 1
+    return 16 * step, 219 * step, 128 * step, 224 * step
 
 
 def _require_yuv(frame: VideoFrame, name: str) -> None:

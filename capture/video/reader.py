@@ -20,7 +20,7 @@ from capture.video.colour import VideoColour, bit_depth, colour_of_frame
 # Only containers that phones write, and only the file itself: FFmpeg would otherwise follow playlists to
 # other files and addresses, and take text for video.
 _INPUT_OPTIONS = {
-    "format_whitelist": "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm",
+    "format_whitelist": "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts",
     "protocol_whitelist": "file",
 }
 _LARGEST_PIXELS = 1 << 26
@@ -195,12 +195,14 @@ def _why_unreadable(path: Path) -> str:
             "its index (moov) is missing or damaged, as when the recording or the copy was cut off; "
             "copy it again from the phone or repair it with an mp4 recovery tool"
         )
-    return "it is no mp4, 3gp or webm video, or its beginning is damaged"
+    return "it is no mp4, 3gp, webm, avi or ts video, or its beginning is damaged"
 
 
 def _video_stream(container: InputContainer, path: Path) -> VideoStream:
     for stream in container.streams.video:
         if not stream.disposition & Disposition.attached_pic:
+            if stream.codec_context is None:
+                raise SourceError(f"{path} is coded in a way that is not known here; it may be damaged.")
             if stream.codec_context.width * stream.codec_context.height > _LARGEST_PIXELS:
                 raise SourceError(
                     f"{path} claims pictures of more than {_LARGEST_PIXELS} pixels; it is damaged."

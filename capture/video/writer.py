@@ -12,7 +12,6 @@ from typing import Self, cast
 import av
 import numpy as np
 from av.video.frame import VideoFrame
-from av.video.reformatter import VideoReformatter
 from av.video.stream import VideoStream
 from numpy.typing import NDArray
 
@@ -21,16 +20,19 @@ from capture.video.colour import (
     MATRIX_CODES,
     PRIMARIES_CODES,
     RANGE_CODES,
-    SWSCALE_EXACT,
-    SWSCALE_MATRIX,
-    SWSCALE_RANGE,
     TRANSFER_CODES,
     default_matrix,
+    fill_frame,
 )
 
 _ENCODERS = {"h264": "libx264", "hevc": "libx265"}
 _TIME_BASE = Fraction(1, 90_000)  # what Android's MPEG4Writer uses for video
 _ENCODER_THREADS = 2  # fixed, because the bytes depend on it
+_CONTAINER_OPTIONS = {
+    "video_track_timescale": "90000",
+    "movie_timescale": "90000",  # of the start offset; phones write 1000, which rounds it to 1 ms
+    "fflags": "+bitexact",
+}
 
 
 class VideoWriter:
@@ -101,23 +103,7 @@ class VideoWriter:
         self._pixel_format = "yuv420p" if bits == 8 else "yuv420p10le"
         self._matrix = matrix or default_matrix(width, height)
         self._range = color_range or "limited"
-        self._reformatter = VideoReformatter()
         self._last_ticks: int | None = None
-        try:
-            self._container = av.open(
-                str(self.path),
-                "w",
-                format="mp4",
-                options={"video_track_timescale": "90000", "fflags": "+bitexact"},
-            )
-        except (av.FFmpegError, OSError) as error:
-            raise SourceError(f"{self.path} cannot be written: {error}.") from error
-        if creation_time is not None:
-            self._container.metadata["creation_time"] = creation_time.astimezone(UTC).strftime(
-                "%Y-%m-%dT%H:%M:%SZ"
-            )
-        if location is not None:
-            self._container.metadata["location"] = location
         options = {"preset": preset}
         if bit_rate is None:
             options["crf"] = f"{crf:g}"
@@ -125,23 +111,35 @@ class VideoWriter:
             options["bf"] = "0"
         else:
             options["x265-params"] = f"log-level=none:bframes=0:pools={_ENCODER_THREADS}:frame-threads=1"
-        stream = cast(VideoStream, self._container.add_stream(_ENCODERS[codec], rate=30, options=options))
-        stream.width, stream.height, stream.pix_fmt = width, height, self._pixel_format
-        if rotation_deg:
-            stream.set_display_rotation(-rotation_deg)
-        context = stream.codec_context
-        context.time_base = _TIME_BASE
-        context.gop_size = keyframe_interval
-        context.thread_count = _ENCODER_THREADS
-        if bit_rate is not None:
-            context.bit_rate = bit_rate
-        if codec == "hevc":
-            context.codec_tag = "hvc1"
-        context.color_range = RANGE_CODES[color_range] if color_range else 0
-        context.colorspace = MATRIX_CODES[matrix] if matrix else 2
-        context.color_primaries = PRIMARIES_CODES[matrix] if matrix else 2
-        context.color_trc = TRANSFER_CODES[transfer] if transfer else 2
-        self._stream = stream
+        try:
+            self._container = av.open(str(self.path), "w", format="mp4", options=_CONTAINER_OPTIONS)
+            if creation_time is not None:
+                self._container.metadata["creation_time"] = (
+                    f"{creation_time.astimezone(UTC):%Y-%m-%dT%H:%M:%SZ}"
+                )
+            if location is not None:
+                self._container.metadata["location"] = location
+            encoder = _ENCODERS[codec]
+            self._stream = cast(VideoStream, self._container.add_stream(encoder, rate=30, options=options))
+            self._stream.width, self._stream.height = width, height
+            self._stream.pix_fmt = self._pixel_format
+            if rotation_deg:
+                self._stream.set_display_rotation(-rotation_deg)
+            context = self._stream.codec_context
+            context.time_base = _TIME_BASE
+            context.gop_size = keyframe_interval
+            context.thread_count = _ENCODER_THREADS
+            if bit_rate is not None:
+                context.bit_rate = bit_rate
+            if codec == "hevc":
+                context.codec_tag = "hvc1"
+            context.color_range = RANGE_CODES[color_range] if color_range else 0
+            context.colorspace = MATRIX_CODES[matrix] if matrix else 2
+            context.color_primaries = PRIMARIES_CODES[matrix] if matrix else 2
+            context.color_trc = TRANSFER_CODES[transfer] if transfer else 2
+            self._container.start_encoding()
+        except (av.FFmpegError, OSError) as error:
+            raise SourceError(f"{self.path} cannot be written: {error}.") from error
 
     def write(self, rgb: NDArray[np.uint8], pts_s: float) -> None:
         """Append one frame.
@@ -160,16 +158,8 @@ class VideoWriter:
         if ticks < 0 or (self._last_ticks is not None and ticks <= self._last_ticks):
             raise ValueError(f"The frame time {pts_s} s is negative or not later than the frame before.")
         self._last_ticks = ticks
-        matrix = SWSCALE_MATRIX[self._matrix]
-        frame = self._reformatter.reformat(
-            VideoFrame.from_ndarray(np.ascontiguousarray(rgb), "rgb24"),
-            format=self._pixel_format,
-            src_colorspace=matrix,
-            dst_colorspace=matrix,
-            src_color_range=SWSCALE_RANGE["full"],
-            dst_color_range=SWSCALE_RANGE[self._range],
-            interpolation=SWSCALE_EXACT,
-        )
+        frame = VideoFrame(width, height, self._pixel_format)
+        fill_frame(frame, rgb, self._matrix, self._range)
         frame.pts, frame.time_base = ticks, _TIME_BASE
         self._mux(frame)
 
