@@ -14,6 +14,10 @@ from numpy.typing import NDArray
 _SSIM_K1, _SSIM_K2 = 0.01, 0.03
 _SSIM_WINDOW_PX = 7
 
+# How far around the true silhouette the mask is looked at; how far off a right outline may be.
+BAND_PX = 10.0
+TOLERANCE_PX = 1.5
+
 Picture = NDArray[np.floating]
 Region = NDArray[np.bool_]
 
@@ -103,7 +107,7 @@ def mask_iou(mask: Picture, truth: Picture, threshold: float = 0.5) -> float:
     return np.count_nonzero(first & second) / union if union else float("nan")
 
 
-def alpha_error(mask: Picture, truth: Picture, band_px: float = 10.0) -> float:
+def alpha_error(mask: Picture, truth: Picture, band_px: float = BAND_PX) -> float:
     """Mean |mask - truth| within `band_px` of the true silhouette, where hair is: 0 perfect, 1 worst.
 
     The silhouette is where the true mask [H, W] crosses 0.5; the picture's border is none.
@@ -114,7 +118,7 @@ def alpha_error(mask: Picture, truth: Picture, band_px: float = 10.0) -> float:
     return float(np.mean(np.abs(mask[band].astype(np.float64) - truth[band])))
 
 
-def silhouette_f_score(mask: Picture, truth: Picture, tolerance_px: float = 1.5) -> float:
+def silhouette_f_score(mask: Picture, truth: Picture, tolerance_px: float = TOLERANCE_PX) -> float:
     """Harmonic mean of the shares of either silhouette that lie within a tolerance of the other.
 
     Unlike the IoU it sees strands of hair: it counts length, not area (the boundary measure F of Perazzi
