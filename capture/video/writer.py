@@ -104,6 +104,8 @@ class VideoWriter:
         self._matrix = matrix or default_matrix(width, height)
         self._range = color_range or "limited"
         self._last_ticks: int | None = None
+        self._last_duration = round(1 / 30 / float(_TIME_BASE))
+        self._held: av.Packet[VideoStream] | None = None  # the last packet, until its duration is known
         options = {"preset": preset}
         if bit_rate is None:
             options["crf"] = f"{crf:g}"
@@ -157,6 +159,8 @@ class VideoWriter:
         ticks = round(pts_s / float(_TIME_BASE))
         if ticks < 0 or (self._last_ticks is not None and ticks <= self._last_ticks):
             raise ValueError(f"The frame time {pts_s} s is negative or not later than the frame before.")
+        if self._last_ticks is not None:
+            self._last_duration = ticks - self._last_ticks
         self._last_ticks = ticks
         frame = VideoFrame(width, height, self._pixel_format)
         fill_frame(frame, rgb, self._matrix, self._range)
@@ -164,7 +168,7 @@ class VideoWriter:
         self._mux(frame)
 
     def close(self) -> None:
-        """Finish the file; afterwards it can be read."""
+        """Finish the file; afterwards it can be read. The last frame lasts as long as the one before it."""
         self._mux(None)
         self._container.close()
 
@@ -183,7 +187,12 @@ class VideoWriter:
     def _mux(self, frame: VideoFrame | None) -> None:
         try:
             for packet in self._stream.encode(frame):
-                self._container.mux(packet)
+                if self._held is not None:
+                    self._container.mux(self._held)
+                self._held = packet
+            if frame is None and self._held is not None:
+                self._held.duration = self._last_duration
+                self._container.mux(self._held)
         except (av.FFmpegError, OSError) as error:
             raise SourceError(f"{self.path} cannot be written: {error}.") from error
 
