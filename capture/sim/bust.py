@@ -17,6 +17,7 @@ from capture.sim.subject import Subject
 
 _M_PER_MM = 1e-3
 _EYE_GLOSS = 0.045
+_STRAND_GLOSS = 0.014
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,8 +31,7 @@ class Bust:
         gloss: [V] float32 mirror reflectance at normal incidence.
         wet: [V] bool, sharp reflections (eyes).
         tangents: [V, 3] float32 along the strand; zero off the strands.
-        solid: [T, 3] int32 triangles of closed surfaces.
-        strands: [S, 3] int32 triangles of ribbons, two-sided.
+        triangles: [T, 3] int32, counter-clockwise seen from outside; those of the strands are the last.
         strand_start: index of the first vertex of a strand.
         occluder: a coarser mesh of the same surface, for broad shadows.
         occluder_of: [V, 3] int32 the occluder's vertices nearest to each vertex.
@@ -43,11 +43,20 @@ class Bust:
     gloss: np.ndarray
     wet: np.ndarray
     tangents: np.ndarray
-    solid: np.ndarray
-    strands: np.ndarray
+    triangles: np.ndarray
     strand_start: int
     occluder: Mesh
     occluder_of: np.ndarray
+
+    @property
+    def solid_triangles(self) -> np.ndarray:
+        """[S, 3] int32 triangles of skin, cloth, hair volume and eyes."""
+        return self.triangles[self.triangles[:, 0] < self.strand_start]
+
+    @property
+    def strand_triangles(self) -> np.ndarray:
+        """[S, 3] int32 triangles of the strands."""
+        return self.triangles[self.triangles[:, 0] >= self.strand_start]
 
 
 def build_bust(subject: Subject, cell_mm: float = 2.2, subdivisions: int = 1, strands: int = 9000) -> Bust:
@@ -81,7 +90,7 @@ def build_bust(subject: Subject, cell_mm: float = 2.2, subdivisions: int = 1, st
     streaks = 1.0 + 0.35 * value_noise(hair._across(fine.vertices), 1.4, subject.seed + 90)
     albedo[combed] = (np.array(subject.hair) * 0.6 * streaks[:, None])[combed]
     gloss[combed] = 0.012
-    eyes = make_eyes(subject)
+    eyes = make_eyes(head)
     rng = np.random.default_rng(subject.seed + 1000)
     locks: list[Strands] = []
     if combed.any() and strands:
@@ -92,8 +101,9 @@ def build_bust(subject: Subject, cell_mm: float = 2.2, subdivisions: int = 1, st
 
 
 def _deserves_detail(points: np.ndarray, head: HeadShape, hair: HairShape) -> np.ndarray:
-    """Vertices [V] bool of the face, ears and neck: cloth shows no pores, and hair is covered by strands."""
-    return (points[:, 1] > -150.0) & (hair.distance(points) > head.distance(points) - 0.5)
+    """Vertices [V] bool of the face, ears, neck and collar: cloth shows no pores, and hair is covered by strands."""
+    collar = np.abs(head.collar(points)) < 9.0
+    return ((points[:, 1] > -150.0) | collar) & (hair.distance(points) > head.distance(points) - 0.5)
 
 
 def _assemble(
@@ -113,7 +123,7 @@ def _assemble(
     vertices = np.concatenate([fine.vertices, eyes.vertices, *(lock.vertices for lock in locks)])
     strand_triangles = [lock.triangles + start for lock, start in zip(locks, counts[:-1], strict=True)]
     count = len(vertices)
-    all_gloss = np.full(count, 0.02, dtype=np.float32)
+    all_gloss = np.full(count, _STRAND_GLOSS, dtype=np.float32)
     all_gloss[:eye_start] = gloss
     all_gloss[eye_start:strand_start] = _EYE_GLOSS
     wet = np.zeros(count, dtype=bool)
@@ -130,8 +140,9 @@ def _assemble(
         gloss=all_gloss,
         wet=wet,
         tangents=tangents,
-        solid=np.concatenate([fine.triangles, eyes.triangles + eye_start]).astype(np.int32),
-        strands=np.concatenate([empty.astype(np.int32), *strand_triangles]).astype(np.int32),
+        triangles=np.concatenate([fine.triangles, eyes.triangles + eye_start, *strand_triangles]).astype(
+            np.int32
+        ),
         strand_start=strand_start,
         occluder=Mesh((coarse.vertices * _M_PER_MM).astype(np.float32), coarse.triangles),
         occluder_of=nearest.astype(np.int32),

@@ -42,10 +42,10 @@ def _sample(
 
 def sample_surface(bust: Bust, count: int, rng: np.random.Generator) -> PointCloud:
     """Exact points on skin, shirt, hair and some strands, with shading normals and sRGB reflectance as colours."""
-    on_strands = round(count * _STRAND_SHARE) if len(bust.strands) else 0
-    parts = [_sample(bust, bust.solid, count - on_strands, rng)]
+    on_strands = round(count * _STRAND_SHARE) if len(bust.strand_triangles) else 0
+    parts = [_sample(bust, bust.solid_triangles, count - on_strands, rng)]
     if on_strands:
-        parts.append(_sample(bust, bust.strands, on_strands, rng))
+        parts.append(_sample(bust, bust.strand_triangles, on_strands, rng))
     points, normals, albedo = (np.concatenate(values) for values in zip(*parts, strict=True))
     return PointCloud(points, normals, to_display(albedo, "srgb"))
 
@@ -62,7 +62,7 @@ def stereo_cloud(bust: Bust, cameras: list[Camera], count: int, rng: np.random.G
     rays = np.zeros_like(exact.points)
     for camera in cameras:
         raster = Raster.empty(camera)
-        raster.draw(bust.vertices, bust.solid, None, closed=True)
+        raster.draw(bust.vertices, bust.triangles, None)
         pixel, depth = project(camera, exact.points)
         inside = (
             (depth > 0)

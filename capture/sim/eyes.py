@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from capture.sim.head import EYE_CENTRE, EYE_RADIUS
+from capture.sim.head import EYE_CENTRE, EYE_RADIUS, HeadShape
 from capture.sim.meshing import Mesh
 from capture.sim.noise import fractal_noise
 from capture.sim.sdf import smooth_step
@@ -32,8 +32,9 @@ class Eyes:
     albedo: np.ndarray
 
 
-def make_eyes(subject: Subject) -> Eyes:
+def make_eyes(head: HeadShape) -> Eyes:
     """Both eyes, looking ahead and a little inwards at whoever holds the phone."""
+    subject = head.subject
     meshes, albedos = [], []
     for side in (1.0, -1.0):
         angle = np.linspace(0.0, 0.62 * np.pi, _RINGS)[:, None]
@@ -43,12 +44,12 @@ def make_eyes(subject: Subject) -> Eyes:
             [np.sin(angle) * np.cos(around), np.sin(angle) * np.sin(around), np.cos(angle) + 0 * around],
             axis=-1,
         )
-        inwards = np.radians(2.0) * -side
+        inwards = np.radians(3.2) * -side
         turn = np.array(
             [[np.cos(inwards), 0, np.sin(inwards)], [0, 1, 0], [-np.sin(inwards), 0, np.cos(inwards)]]
         )
         centre = np.array(EYE_CENTRE) * [side, 1, 1]
-        vertices = (radius[..., None] * unit).reshape(-1, 3) @ turn.T + centre
+        vertices = head.unfold((radius[..., None] * unit).reshape(-1, 3) @ turn.T + centre)
         meshes.append(Mesh(vertices.astype(np.float32), _grid_triangles() + len(meshes) * _RINGS * _SPOKES))
         albedos.append(_paint(angle + 0 * around, around + 0 * angle, subject, subject.seed + int(side)))
     mesh = Mesh(

@@ -37,7 +37,7 @@ class HairShape:
 
     def inside_line(self, q: np.ndarray) -> np.ndarray:
         """Distance [P] above the hairline (folded points), negative on the face."""
-        wave = 2.5 * np.sin(q[:, 0] / 6.0) + 1.5 * np.sin(q[:, 2] / 4.3)
+        wave = 1.2 * np.sin(q[:, 0] / 6.0) + 0.8 * np.sin(q[:, 2] / 4.3)
         line = (q[:, 1] - np.interp(q[:, 2], _LINE_Z, _LINE_Y).astype(np.float32) + wave) * np.float32(0.8)
         around_ear = bump(q[:, 2], -8.0, 13.0) * smooth_step(q[:, 1], 34.0, 16.0)
         return line - 40.0 * around_ear
@@ -151,18 +151,22 @@ def comb_strands(
     )
 
 
+def brow_density(q: np.ndarray) -> np.ndarray:
+    """How densely brow hairs grow, 0..1, at folded points [P, 3]."""
+    x, y, z = q.T
+    arch = 17.5 + 5.0 * bump(x, 36, 13) - 2.0 * smooth_step(x, 40, 52)
+    thickness = np.maximum(1.9 * smooth_step(x, 58, 34), 0.5)
+    along = smooth_step(x, 8, 14) * smooth_step(x, 54, 46) * (z > 45)
+    return np.exp(-0.5 * ((y - arch) / thickness) ** 2) * along
+
+
 def brow_strands(
     head: HeadShape, surface: np.ndarray, normals: np.ndarray, count: int, rng: np.random.Generator
 ) -> Strands:
     """Eyebrow hairs on the skin's surface [S, 3] with unit normals [S, 3]."""
     q = head.fold(surface)
-    x, y, z = q.T
-    arch = 17.5 + 5.0 * bump(x, 36, 13) - 2.0 * smooth_step(x, 40, 52)
-    thick = 3.4 * smooth_step(x, 58, 34)
-    weight = np.exp(-0.5 * ((y - arch) / np.maximum(thick * 0.55, 0.5)) ** 2)
-    weight = weight * smooth_step(x, 8, 13) * smooth_step(x, 54, 47) * (z > 45)
+    weight = brow_density(q)
     roots = rng.choice(len(surface), size=count, p=weight / weight.sum())
-    away = np.sign(surface[:, 0])
 
     def flow(points: np.ndarray, at_normals: np.ndarray) -> np.ndarray:
         side = np.where(points[:, 0] > 0, 1.0, -1.0)
@@ -172,8 +176,7 @@ def brow_strands(
         wish -= (wish * at_normals).sum(axis=-1, keepdims=True) * at_normals
         return wish / np.maximum(np.linalg.norm(wish, axis=-1, keepdims=True), 1e-6)
 
-    assert len(away) == len(surface)
-    near = (np.abs(x - 30) < 40) & (np.abs(y - 18) < 25) & (z > 30)
+    near = (np.abs(q[:, 0] - 30) < 40) & (np.abs(q[:, 1] - 18) < 25) & (q[:, 2] > 30)
     colour = np.array(head.subject.hair) * 0.8 * np.exp(rng.normal(0.0, 0.25, (count, 1)))
     lengths = rng.uniform(5.0, 9.0, count)
     lift = rng.uniform(0.15, 0.7, count)

@@ -39,28 +39,44 @@ class HeadShape:
 
     def fold(self, points: np.ndarray) -> np.ndarray:
         """Points of the symmetric head: asymmetry taken out, x made positive (towards the left ear)."""
-        s = self.subject
         folded = np.array(points, dtype=np.float32)
-        phase = np.random.default_rng(s.seed + 7).uniform(0.0, 2.0 * np.pi, 2).astype(np.float32)
-        folded[:, 0] += 0.8 * np.sin(points[:, 1] / 23.0 + phase[0]) * np.sin(points[:, 2] / 31.0)
-        folded[:, 1] += 0.9 * np.sin(points[:, 0] / 29.0 + phase[1])
-        folded[:, 0] = np.abs(folded[:, 0])
-        head = smooth_step(folded[:, 1], -170.0, -110.0)
-        width = s.head_width * (1.0 + (s.jaw_width - 1.0) * smooth_step(folded[:, 1], -10.0, -70.0))
-        folded[:, 0] /= 1.0 + head * (width - 1.0)
+        folded[:, :2] += self._asymmetry(points)
+        folded[:, 0] = np.abs(folded[:, 0]) / self._width(folded[:, 1])
         return folded
+
+    def unfold(self, points: np.ndarray) -> np.ndarray:
+        """Where points of the symmetric head, x of either sign, really are: `fold` undone, to a few hundredths of a mm."""
+        real = np.array(points, dtype=np.float32)
+        real[:, 0] *= self._width(real[:, 1])
+        real[:, :2] -= self._asymmetry(real)
+        return real
+
+    def _asymmetry(self, points: np.ndarray) -> np.ndarray:
+        phase = np.random.default_rng(self.subject.seed + 7).uniform(0.0, 2.0 * np.pi, 2).astype(np.float32)
+        sideways = 0.8 * np.sin(points[:, 1] / 23.0 + phase[0]) * np.sin(points[:, 2] / 31.0)
+        return np.stack([sideways, 0.9 * np.sin(points[:, 0] / 29.0 + phase[1])], axis=-1)
+
+    def _width(self, height: np.ndarray) -> np.ndarray:
+        s = self.subject
+        width = s.head_width * (1.0 + (s.jaw_width - 1.0) * smooth_step(height, -10.0, -70.0))
+        return 1.0 + smooth_step(height, -170.0, -110.0) * (width - 1.0)
 
     def distance(self, points: np.ndarray) -> np.ndarray:
         """Signed distance [P] to skin and shirt together (no eyeballs, no hair)."""
         q = self.fold(points)
         skin = self._skin(q)
         shirt = self._shirt(q)
-        return np.maximum(np.minimum(skin, shirt), BUST_FLOOR - points[:, 1])
+        return np.maximum(smooth_union(skin, shirt, 1.5), BUST_FLOOR - points[:, 1])
 
     def shirt_mask(self, points: np.ndarray) -> np.ndarray:
         """1 on the shirt, 0 on skin; [P]."""
         q = self.fold(points)
-        return (self._shirt(q) < self._skin(q)).astype(np.float32)
+        return smooth_step(self._skin(q) - self._shirt(q), -0.6, 0.6)
+
+    def collar(self, points: np.ndarray) -> np.ndarray:
+        """Distance [P] from the shirt's neckline, positive on the shirt's side; far positive above the neck."""
+        q = self.fold(points)
+        return np.where(q[:, 1] < -100.0, self._below_collar(q), 1e3)
 
     def _skin(self, q: np.ndarray) -> np.ndarray:
         # The neck and the body are far from most points of the face and the other way round: skip what cannot touch.
@@ -81,7 +97,7 @@ class HeadShape:
         d = ellipsoid(q, (0, 34, -14), (73, 79, 92))
         d = smooth_union(d, ellipsoid(q, (0, 40, 22), (60, 54, 62)), 24)
         d = smooth_union(d, ellipsoid(q, (0, -22, 22), (59, 79, 64)), 22)
-        d = smooth_union(d, round_cone(q, (48, -60, 8), (11, -101, 66), (14, 11)), 26)
+        d = smooth_union(d, round_cone(q, (47, -60, 9), (11, -101, 66), (12.5, 11)), 26)
         d = smooth_union(d, ellipsoid(q, (0, -102, 70 + 6 * (s.chin - 1)), (16, 14, 16 * s.chin)), 18)
         d = smooth_union(d, ellipsoid(q, (45, -22, 50), (17, 11, 22)), 22)
         d = smooth_union(d, ellipsoid(q, (33, -50, 48), (27, 34, 30)), 20)
@@ -98,7 +114,7 @@ class HeadShape:
         if not near.any():
             return d
         p, skin = q[near], d[near]
-        skin = smooth_union(skin, sphere(p, EYE_CENTRE, EYE_RADIUS + 1.5), 4.5)
+        skin = smooth_union(skin, sphere(p, EYE_CENTRE, EYE_RADIUS + 1.4), 6.5)
         over, under, forward = self._lid_margins(p)
         crease = bump(over, 3.6, 1.0) * smooth_step(forward, 0.0, 6.0) * bump(p[:, 0], EYE_CENTRE[0], 9.0)
         bag = bump(under, 5.5, 2.2) * smooth_step(forward, 0.0, 6.0) * bump(p[:, 0], EYE_CENTRE[0], 9.0)
@@ -113,7 +129,7 @@ class HeadShape:
         """Heights [P] above the upper and below the lower lid's edge, and depth in front of the eye's centre."""
         e = q - np.array(EYE_CENTRE, np.float32)
         level = e[:, 1] - 0.07 * e[:, 0]
-        u = np.clip((e[:, 0] + 0.6) / 13.6, -1.4, 1.4)
+        u = np.clip(e[:, 0] / 13.8, -1.4, 1.4)
         upper = 5.0 * (1.0 - np.abs(u) ** 2.2) - 0.9 * u * (1.0 - u * u)
         lower = 4.3 * (1.0 - u * u)
         return 0.9 * (level - upper), 0.9 * (-level - lower), e[:, 2]
@@ -131,9 +147,9 @@ class HeadShape:
             return d
         s, p, skin = self.subject, q[near], d[near]
         out, wide = 22.0 * (s.nose_length - 1.0), s.nose_width
-        skin = smooth_union(skin, round_cone(p, (0, 20, 78), (0, -34, 99 + out), (6.0, 8.5)), 14)
-        skin = smooth_union(skin, ellipsoid(p, (0, -39.5, 101 + out), (8.5 * wide, 7.5, 9.5)), 10)
-        skin = smooth_union(skin, ellipsoid(p, (11.5 * wide, -43, 92 + out), (6.8, 6.6, 10.5)), 7)
+        skin = smooth_union(skin, round_cone(p, (0, 20, 75.5), (0, -33, 97.5 + out), (7.0, 9.3)), 15)
+        skin = smooth_union(skin, ellipsoid(p, (0, -39.5, 100.5 + out), (8.8 * wide, 7.6, 9.5)), 9)
+        skin = smooth_union(skin, ellipsoid(p, (12.0 * wide, -43, 91 + out), (6.6, 6.6, 10.5)), 8)
         skin = smooth_union(skin, capsule(p, (0, -46, 101 + out), (0, -53, 83), 3.2), 6)
         nostril = ellipsoid(p, (6.8 * wide, -50.5, 96 + out), (3.0, 4.5, 5.0))
         skin = smooth_subtract(skin, nostril, 2.2)
@@ -218,24 +234,26 @@ class HeadShape:
         lobe = ellipsoid(e, (6.0, -24.0, 2.5), (8.5, 9.0, 3.6))
         tragus = ellipsoid(e, (0.5, -6.0, 3.5), (4.0, 6.5, 4.0))
         ear = smooth_union(smooth_union(plate, rim, 2.5), smooth_union(fold, lobe, 2.5), 2.5)
-        concha = ellipsoid(e, (9.0, -6.0, 6.5), (7.5, 10.5, 7.0))
+        concha = ellipsoid(e, (9.0, -6.0, 8.6), (7.5, 10.5, 6.4))
         ear = smooth_subtract(ear, concha, 2.0)
         ear = smooth_union(ear, tragus, 2.5)
         result = d.copy()
         result[near] = smooth_union(skin, ear * size, 5.0)
         return result
 
-    def _body(self, q: np.ndarray) -> np.ndarray:
+    def _torso(self, q: np.ndarray) -> np.ndarray:
         wide = self.subject.neck_width
         d = round_cone(q, (0, -60, -22), (0, -190, -38), (49 * wide, 51 * wide))
         d = smooth_union(d, capsule(q, (53 * wide, -48, -22), (12, -190, 8), 8.0), 16)
-        d = smooth_union(d, ellipsoid(q, (0, -128, 21 * wide), (8, 15, 9)), 16)
+        d = smooth_union(d, ellipsoid(q, (0, -128, 21 * wide), (6, 13, 7.5)), 16)
         d = smooth_union(d, round_cone(q, (20, -124, -58), (136, -208, -48), (22, 32)), 36)
         d = smooth_union(d, capsule(q, (0, -246, -36), (158, -244, -44), 46), 40)
         d = smooth_union(d, ellipsoid(q, (0, -318, -26), (160, 142, 84)), 40)
         d = smooth_union(d, capsule(q, (178, -250, -42), (204, -420, -38), 46), 26)
-        d = smooth_union(d, capsule(q, (12, -200, 22), (128, -200, -4), 6.0), 18)
-        return smooth_subtract(d, ellipsoid(q, (0, -196, 33), (9, 10, 12)), 18)
+        return smooth_union(d, capsule(q, (12, -200, 22), (128, -200, -4), 6.0), 18)
+
+    def _body(self, q: np.ndarray) -> np.ndarray:
+        return smooth_subtract(self._torso(q), ellipsoid(q, (0, -196, 33), (9, 10, 12)), 18)
 
     def _below_collar(self, q: np.ndarray) -> np.ndarray:
         """Distance [P] below the collar's seam, positive on the shirt's side: low in front, high at the nape."""
@@ -251,6 +269,6 @@ class HeadShape:
         folds = value_noise(p * np.array([1.0, 0.45, 1.0], np.float32), 34.0, self.subject.seed + 21)
         wrinkle = 2.2 * folds * smooth_step(below, 10.0, 60.0)
         rib = 1.6 * smooth_step(np.abs(below - 9.0), 9.5, 8.0)
-        cloth = self._body(p) - 4.5 - wrinkle - rib
+        cloth = self._torso(p) - 5.5 - wrinkle - rib
         result[near] = smooth_subtract(cloth, below, 1.5)
         return result

@@ -56,8 +56,8 @@ def _active_blocks(distance: Distance, lower: np.ndarray, upper: np.ndarray, cel
     for per_block in (4, 2, 1):
         size = cell * _BLOCK * per_block
         centres = (lower + (blocks + 0.5) * size).astype(np.float32)
-        # 0.87 = half the diagonal of a unit cube; the margin covers smooth unions, whose slope may pass 1.
-        blocks = blocks[np.abs(distance(centres)) < 0.87 * 1.35 * size]
+        # 0.87 = half the diagonal of a unit cube; the margin covers smooth unions, whose slope may pass 1, and ears.
+        blocks = blocks[np.abs(distance(centres)) < 0.87 * 1.8 * size]
         if per_block > 1:
             blocks = (blocks[:, None, :] * 2 + _CORNERS).reshape(-1, 3)
     return blocks

@@ -74,21 +74,18 @@ class Raster:
         """[H, W] bool: something was drawn."""
         return self.depth < FAR_M
 
-    def draw(
-        self, vertices: np.ndarray, triangles: np.ndarray, attributes: np.ndarray | None, *, closed: bool
-    ) -> None:
+    def draw(self, vertices: np.ndarray, triangles: np.ndarray, attributes: np.ndarray | None) -> None:
         """Draw triangles, in front of or behind what is there.
 
         Args:
             vertices: [V, 3] float32, world.
-            triangles: [T, 3] int32; any that crosses the camera's plane must have been left out.
+            triangles: [T, 3] int32, counter-clockwise seen from outside (their backs are not drawn); any that crosses the camera's plane must have been left out.
             attributes: [V, 3] float32 interpolated over the triangles; None draws depth alone.
-            closed: counter-clockwise triangles of a closed surface, so that its back need not be drawn.
         """
         matrix, fov_y = _opengl_camera(self.camera)
         settings = cv2.TriangleRasterizeSettings()
         settings.setShadingType(cv2.RASTERIZE_SHADING_SHADED)
-        settings.setCullingMode(cv2.RASTERIZE_CULLING_CW if closed else cv2.RASTERIZE_CULLING_NONE)
+        settings.setCullingMode(cv2.RASTERIZE_CULLING_CW)
         if attributes is None:
             self.depth = cv2.triangleRasterizeDepth(
                 vertices, triangles, self.depth, matrix, fov_y, NEAR_M, FAR_M, settings

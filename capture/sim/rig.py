@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 
 from capture.cameras import Camera
+from capture.sim.ahead import computed_ahead
 from capture.sim.bust import Bust, build_bust
 from capture.sim.camera_path import CameraPath
 from capture.sim.environment import Environment, SoftBox, studio_map
@@ -92,8 +93,8 @@ class RigConfig:
     lamp: LampConfig = field(default_factory=LampConfig)
     sensor: SensorConfig = field(default_factory=SensorConfig)
     flash_offset_cam_m: tuple[float, float, float] = (0.013, -0.007, 0.0)
-    flash_color: tuple[float, float, float] = (0.165, 0.160, 0.150)
-    room_level: float = 0.36
+    flash_color: tuple[float, float, float] = (0.235, 0.228, 0.215)
+    room_level: float = 0.55
     rotation_deg: int = 0
     posed_frames: int = 60
     flash_every: int = 5
@@ -142,6 +143,16 @@ class RigConfig:
             strands=500,
             shadow_directions=24,
         )
+
+
+@dataclass(frozen=True)
+class _Exposure:
+    """A frame that is to be taken: its place in the file, the sensor's count, its start, losses before it."""
+
+    index: int
+    tick: int
+    start_s: float
+    dropped_before: int
 
 
 @dataclass(frozen=True)
@@ -297,17 +308,20 @@ class Rig:
         """The recording's frames, in order, made as they are asked for; lost ones are not among them."""
         c, sensor = self.config, self.config.sensor
         rng = np.random.default_rng([sensor.seed, 5])
-        index = dropped = 0
+        exposures: list[_Exposure] = []
+        dropped = 0
         for tick in range(round(c.path.duration_s * c.fps)):
             start_s = max(0.0, tick / c.fps + sensor.timestamp_jitter_s * float(np.clip(rng.normal(), -4, 4)))
             if tick > 0 and rng.random() < sensor.dropped:
                 dropped += 1
                 continue
-            yield self._expose(index, tick, start_s, dropped)
-            index, dropped = index + 1, 0
+            exposures.append(_Exposure(len(exposures), tick, start_s, dropped))
+            dropped = 0
+        yield from computed_ahead(self._expose, exposures)
 
-    def _expose(self, index: int, tick: int, start_s: float, dropped_before: int) -> RigFrame:
+    def _expose(self, exposure: _Exposure) -> RigFrame:
         c, sensor = self.config, self.config.sensor
+        index, start_s = exposure.index, exposure.start_s
         middle_s = start_s + 0.5 * (sensor.readout_s + sensor.exposure_s)
         camera = self.camera(middle_s, f"{index:04d}")
         lit = self.pulses.lit_fraction(start_s, camera.height, sensor.readout_s, sensor.exposure_s)
@@ -329,6 +343,8 @@ class Rig:
             lit_max=float(lit.max()),
             on_s=pulse.on_s if pulse else None,
             off_s=pulse.off_s if pulse else None,
-            dropped_before=dropped_before,
+            dropped_before=exposure.dropped_before,
         )
-        return RigFrame(start_s, sensor.develop(radiance.astype(np.float32), tick), camera, lit, truth)
+        return RigFrame(
+            start_s, sensor.develop(radiance.astype(np.float32), exposure.tick), camera, lit, truth
+        )

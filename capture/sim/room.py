@@ -28,7 +28,7 @@ from capture.sim.room_textures import (
 
 _PATCH_M = 0.25  # side of the triangles' squares
 _ATLAS_WIDTH = 2048
-_AMBIENT = 0.55  # light that has bounced often, relative to the direct light's mean over the panels
+_AMBIENT = 0.9  # light that has bounced often, relative to the direct light's mean over the panels
 
 
 @dataclass(frozen=True, eq=False)
@@ -270,7 +270,7 @@ class Room:
             square = (ray * ray).sum(axis=-1)
             strength = np.maximum((ray * self.normals).sum(axis=-1), 0.0) / square**1.5
         raster = Raster.empty(camera)
-        raster.draw(self.vertices, visible, np.column_stack([self.texels, strength]), closed=True)
+        raster.draw(self.vertices, visible, np.column_stack([self.texels, strength]))
         column, row = raster.values[..., 0], raster.values[..., 1]
         room = cv2.remap(self.radiance, column, row, cv2.INTER_LINEAR)
         if flash_position is None:

@@ -32,7 +32,7 @@ def wallpaper_texture(seed: int) -> Texture:
 
     def paint(rows: int, columns: int) -> np.ndarray:
         rng = np.random.default_rng(seed)
-        ground = np.array([0.42, 0.41, 0.36]) * rng.uniform(0.9, 1.1, 3)
+        ground = np.array([0.56, 0.54, 0.47]) * rng.uniform(0.9, 1.1, 3)
         print_ = ground * np.array([0.62, 0.72, 0.70])
         pattern = np.zeros((rows, columns), np.float32)
         pitch = 28

@@ -24,6 +24,7 @@ _SKIN_EXPONENT = 22.0  # Blinn-Phong lobe of skin, about 17 degrees wide at half
 _WET_EXPONENT = 900.0
 _STRAND_EXPONENT = 40.0
 _TURNED_AWAY = -0.25  # cosine; vertices just behind the outline still colour triangles in front of it
+# (a ribbon's edges are bent away from its face: theirs may be lower by 0.5)
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,11 +41,11 @@ class Layer:
 
 
 def facing_vertices(bust: Bust, eye: np.ndarray) -> np.ndarray:
-    """Indices [C] of the vertices that a viewer at `eye` [3] may see: not turned away; all of the strands."""
+    """Indices [C] of the vertices that a viewer at `eye` [3] may see: not turned away."""
     to_eye = eye.astype(np.float32) - bust.vertices
     length = np.sqrt(np.einsum("vc,vc->v", to_eye, to_eye))
     cosine = np.einsum("vc,vc->v", to_eye, bust.normals) / length
-    cosine[bust.strand_start :] = 1.0
+    cosine[bust.strand_start :] += 0.5
     return np.nonzero(cosine > _TURNED_AWAY)[0]
 
 
@@ -65,6 +66,7 @@ def environment_gloss(
     wet = bust.wet[chosen]
     light[wet] = look_up(environment.mirrored_wet, mirrored[wet])
     fresnel = 1.0 + 4.0 * np.clip(1.0 - cosine, 0.0, 1.0) ** 5
+    fresnel[chosen >= bust.strand_start] = 1.0
     return light * fresnel * bust.gloss[chosen, None] * passed[chosen]
 
 
@@ -112,9 +114,7 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
 def draw_vertices(bust: Bust, camera: Camera, attributes: np.ndarray) -> Raster:
     """Vertex attributes [V, 3] seen by a camera, one sample a pixel."""
     raster = Raster.empty(camera)
-    raster.draw(bust.vertices, bust.solid, attributes, closed=True)
-    if len(bust.strands):
-        raster.draw(bust.vertices, bust.strands, attributes, closed=False)
+    raster.draw(bust.vertices, bust.triangles, attributes)
     return raster
 
 

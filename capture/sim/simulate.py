@@ -12,6 +12,7 @@ import numpy as np
 
 from capture.atomic import atomic_write
 from capture.cameras import Camera
+from capture.sim.ahead import computed_ahead
 from capture.sim.rig import Progress, Rig, RigConfig
 from capture.sim.truth import write_cameras, write_clouds, write_frame, write_lights, write_view
 from capture.video.writer import VideoWriter
@@ -47,13 +48,17 @@ def simulate_posed_set(
     probes = {i for i in lit if (i // config.flash_every) % 4 == 2 and i + 1 < config.posed_frames}
     validation = {i + step for i in probes for step in (-1, 0, 1)}
     measured = validation | set(range(0, config.posed_frames, 10))
-    for index in range(config.posed_frames):
-        say("render the posed set", _BUILD_SHARE + (0.97 - _BUILD_SHARE) * index / config.posed_frames)
+
+    def render(index: int) -> Camera:
         time_s = config.path.duration_s * (index + 0.5) / config.posed_frames
         camera = rig.camera(time_s, f"{index:04d}", flash=int(index in lit))
         write_frame(rig, camera, out, noise_index=index)
         if index in measured:
             write_view(rig, camera, out, relight=index in probes or index + 1 in probes)
+        return camera
+
+    for index, camera in enumerate(computed_ahead(render, range(config.posed_frames))):
+        say("render the posed set", _BUILD_SHARE + (0.97 - _BUILD_SHARE) * index / config.posed_frames)
         cameras.append(camera)
         entries.append(
             _posed_entry(camera, index, "val" if index in validation else "train", index in measured)
@@ -146,15 +151,18 @@ def _write_validation(rig: Rig, out: Path) -> None:
     if not config.validation_views:
         return
     rng = np.random.default_rng([config.path.seed, 31])
-    cameras, entries = [], []
+    cameras = []
     for k in range(config.validation_views):
         time_s = config.path.duration_s * (k + 0.5) / config.validation_views
         pose = config.path.cam_from_world(time_s)
         pose[:3, 3] += rng.normal(0.0, 0.012, 3)
-        index = FIRST_VALIDATION_INDEX + k
-        camera = rig.camera_at(pose, f"{index:04d}", flash=k % 2)
+        cameras.append(rig.camera_at(pose, f"{FIRST_VALIDATION_INDEX + k:04d}", flash=k % 2))
+
+    def render(camera: Camera) -> None:
         write_frame(rig, camera, out, noise_index=None)
         write_view(rig, camera, out, relight=True)
-        cameras.append(camera)
-        entries.append(_posed_entry(camera, index, "val", True))
+
+    for _ in computed_ahead(render, cameras):
+        pass
+    entries = [_posed_entry(camera, int(camera.name), "val", True) for camera in cameras]
     write_cameras(rig, out / "cameras_val.json", cameras, entries)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
+from capture.sim.hair import brow_density
 from capture.sim.head import HeadShape
 from capture.sim.noise import fractal_noise, value_noise
 from capture.sim.sdf import bump, smooth_step
@@ -42,7 +43,7 @@ def paint_skin(points: np.ndarray, shape: HeadShape) -> tuple[np.ndarray, np.nda
     blood += 0.12 * np.clip(value_noise(points, 5.0, s.seed + 44), 0, 1) * bump(x, 38, 16) * bump(y, -35, 16)
     melanin += _freckle_density(points, shape)
     socket = bump(x, 31, 13) * bump(y, -9, 6) * (z > 55) + 0.25 * bump(x, 20, 6) * bump(y, 2, 7) * (z > 55)
-    melanin += 0.10 * socket + 0.04 * smooth_step(y, 30, 80)
+    melanin += 0.05 * socket + 0.04 * smooth_step(y, 30, 80)
     beard = smooth_step(y, -38, -60) * smooth_step(y, -135, -112) * smooth_step(z, 5, 30)
     moustache = bump(y, -61, 6.5) * smooth_step(x, 30, 18) * (z > 70)
     beard = np.maximum(beard * smooth_step(z + 0.8 * np.abs(y + 80), 30, 60), moustache) * s.stubble
@@ -54,8 +55,10 @@ def paint_skin(points: np.ndarray, shape: HeadShape) -> tuple[np.ndarray, np.nda
     albedo *= 1.0 - 0.42 * np.clip(beard, 0, 1)[:, None] * np.array([1.0, 0.9, 0.75])
     albedo *= 1.0 - 0.82 * shape.lid_line(points)[:, None]
     albedo *= 1.0 - 0.25 * lips[:, None] * bump(y, -76, 1.0)[:, None]
+    brow = brow_density(q)[:, None]
+    albedo = albedo * (1.0 - 0.55 * brow) + 0.55 * brow * np.array(s.hair) * 1.5
     gloss = 0.040 + 0.018 * _oily(x, y, z) + 0.035 * lips
-    gloss *= s.gloss * (1.0 + 0.25 * value_noise(points, 2.0, s.seed + 47))
+    gloss *= s.gloss * (1.0 + 0.15 * value_noise(points, 2.0, s.seed + 47))
 
     shirt = shape.shirt_mask(points)
     thread = value_noise(points * [1.0, 0.35, 1.0], 1.6, s.seed + 48)
@@ -70,7 +73,7 @@ def _flush(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
     front = z > 40
     cheeks = bump(x, 42, 15) * bump(y, -34, 15) * front
     nose = bump(x, 0, 12) * bump(y, -41, 9) * (z > 82)
-    ears = (x > 62) * bump(y, -10, 26) * bump(z, -8, 22)
+    ears = smooth_step(x, 58, 70) * bump(y, -10, 26) * bump(z, -8, 22)
     chin = bump(x, 0, 15) * bump(y, -104, 9) * front
     lids = bump(x, 32, 13) * bump(y, 1, 9) * front
     neck = smooth_step(y, -125, -160)

@@ -23,7 +23,7 @@ _HAIR_COLOURS = (
     (0.26, 0.16, 0.075),
     (0.20, 0.055, 0.02),
 )
-_IRIS_COLOURS = ((0.10, 0.045, 0.02), (0.06, 0.12, 0.05), (0.07, 0.13, 0.20), (0.16, 0.09, 0.03))
+_IRIS_COLOURS = ((0.10, 0.045, 0.02), (0.06, 0.12, 0.05), (0.045, 0.085, 0.13), (0.16, 0.09, 0.03))
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Subject:
         skin: [3] base reflectance of the skin.
         freckles: number of freckles on the face.
         stubble: 0 (none) .. 1 (dark shadow of a beard).
-        gloss: factor on the skin's gloss; about 2.5 is oily skin under a lamp.
+        gloss: factor on the skin's gloss; about 2 is oily skin under a lamp.
         hair_style: one of `HAIR_STYLES`.
         hair: [3] reflectance of the hair.
         iris: [3] reflectance of the iris.
@@ -90,7 +90,10 @@ class Subject:
             picked = np.array(choices[rng.integers(len(choices))]) * rng.uniform(0.9, 1.1)
             return (float(picked[0]), float(picked[1]), float(picked[2]))
 
-        shirt = rng.uniform(0.04, 0.4, 3)
+        shirt = rng.uniform(0.05, 0.4) * rng.uniform(0.6, 1.4, 3)
+        skin = colour(_SKIN_TONES)
+        # Fair and red hair come with light skin.
+        hair_choices = _HAIR_COLOURS if skin[0] > 0.4 else _HAIR_COLOURS[:2]
         return cls(
             seed=seed,
             head_width=factor(0.03),
@@ -102,12 +105,12 @@ class Subject:
             chin=factor(0.15),
             neck_width=factor(0.07),
             ear_size=factor(0.08),
-            skin=colour(_SKIN_TONES),
+            skin=skin,
             freckles=int(rng.integers(20, 320)),
             stubble=float(rng.choice([0.0, 0.0, 0.25, 0.6])),
-            gloss=float(rng.choice([0.7, 1.0, 1.0, 2.5])),
+            gloss=float(rng.choice([0.7, 1.0, 1.0, 2.0])),
             hair_style=str(rng.choice(HAIR_STYLES)),
-            hair=colour(_HAIR_COLOURS),
+            hair=colour(hair_choices),
             iris=colour(_IRIS_COLOURS),
             shirt=(float(shirt[0]), float(shirt[1]), float(shirt[2])),
         )

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from capture.cameras import Camera
+from capture.sim.ahead import computed_ahead
 from capture.sim.bust import Bust
 from capture.sim.environment import Environment, fibonacci_directions
 from capture.sim.rasterize import Raster, project
@@ -65,9 +66,7 @@ def depth_visibility(raster: Raster, points: np.ndarray, bias_m: float, soft_m: 
 def point_visibility(bust: Bust, position: np.ndarray, chosen: np.ndarray, size: int = 1024) -> np.ndarray:
     """Share of a point light's rays [C] that reach the chosen vertices ([C] indices)."""
     raster = Raster.empty(view_from(position, _TARGET, _REACH_M, size))
-    raster.draw(bust.vertices, bust.solid, None, closed=True)
-    if len(bust.strands):
-        raster.draw(bust.vertices, bust.strands, None, closed=False)
+    raster.draw(bust.vertices, bust.triangles, None)
     # Off the surface by 1.5 mm along the normal and 1 mm in depth: a facet must not shade itself.
     lifted = bust.vertices[chosen] + np.float32(0.0015) * bust.normals[chosen]
     return depth_visibility(raster, lifted, 0.001, 0.003)
@@ -96,16 +95,20 @@ class BroadShadows:
         shape = (len(points), 3)
         received = [np.full(shape, 1e-6, np.float32) for _ in environments]
         unblocked = [np.full(shape, 1e-6, np.float32) for _ in environments]
-        for k, direction in enumerate(towards):
+
+        def seen_from(direction: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
             cosine = np.maximum(normals @ direction.astype(np.float32), 0.0)
             facing = np.nonzero(cosine > 0)[0]
             raster = Raster.empty(view_from(_TARGET + _FAR_LIGHT_M * direction, _TARGET, _REACH_M, size))
-            raster.draw(points, bust.occluder.triangles, None, closed=True)
-            open_ = depth_visibility(raster, lifted[facing], 0.002, 0.004) * cosine[facing]
+            raster.draw(points, bust.occluder.triangles, None)
+            open_ = depth_visibility(raster, lifted[facing], 0.002, 0.004)
+            return facing, cosine[facing], open_
+
+        for k, (facing, cosine, open_) in enumerate(computed_ahead(seen_from, towards)):
             for power, sum_received, sum_unblocked in zip(powers, received, unblocked, strict=True):
-                light = power[k].astype(np.float32)
+                light = cosine[:, None] * power[k].astype(np.float32)
+                sum_unblocked[facing] += light
                 sum_received[facing] += open_[:, None] * light
-                sum_unblocked[facing] += cosine[facing, None] * light
         passed = []
         for sum_received, sum_unblocked in zip(received, unblocked, strict=True):
             ratio = sum_received / sum_unblocked
