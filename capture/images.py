@@ -1,13 +1,12 @@
 """Pictures as arrays: RGB order, [H, W, C], never rotated, never rescaled.
 
-Eight- and sixteen-bit pictures (PNG, JPEG, TIFF, WebP) hold stored values; EXR and Radiance HDR hold float32.
+Eight- and sixteen-bit pictures (PNG, JPEG, TIFF) hold stored values; EXR and Radiance HDR hold float32.
 EXIF orientation is ignored on purpose: a frame keeps the sensor's orientation, and the session records the
 rotation.
 """
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -19,12 +18,14 @@ from numpy.typing import NDArray
 
 from capture.atomic import atomic_write as atomic_write
 from capture.errors import ImageError
+from capture.image_header import header_size, is_cut_short
 
 #: Suffixes that `read_image` reads.
-IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp", ".exr", ".hdr"})
+IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".exr", ".hdr"})
 
 # A bound on what a damaged header may make us allocate; the largest phone sensors have 200 million pixels.
 _LARGEST_PIXELS = 1 << 28
+_PIXELS_PER_BYTE = 1 << 14  # of a flat picture: deflate packs 8256 1-bit pixels into one, a JPEG 512
 _HALF_MAX = 65504.0
 
 
@@ -45,16 +46,13 @@ def read_image(path: Path) -> NDArray[Any]:
 
 def decode_image(data: bytes, path: Path) -> NDArray[Any]:
     """As `read_image`, from a file's content; `path` is for messages."""
-    _check_header(data, path)
-    if data[:2] == b"\xff\xd8" and data.rfind(b"\xff\xd9") < data.rfind(b"\xff\xda"):
-        # libjpeg fills what is missing with grey; a start-of-scan without an end-of-image after it tells.
-        raise ImageError(f"{path} is cut short (the JPEG has no end); copy or export it again.")
+    _checked_size(data, path)
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as cause:
         raise ImageError(f"{path} cannot be decoded: {cause.err}.") from cause
     if image is None:
-        raise ImageError(f"{path} is damaged, empty or no picture (PNG, JPEG, TIFF, WebP, BMP, HDR or EXR).")
+        raise ImageError(f"{path} is damaged and cannot be decoded; copy or export it again.")
     if image.dtype not in (np.uint8, np.uint16, np.float32):
         raise ImageError(f"{path} holds {image.dtype} pixels; 8 or 16 bits a channel or float32 are needed.")
     if image.ndim == 3 and image.shape[2] == 4:
@@ -65,15 +63,15 @@ def decode_image(data: bytes, path: Path) -> NDArray[Any]:
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """(width, height) of a picture in pixels, from its header where that is enough (PNG, JPEG, EXR)."""
+    """(width, height) of a picture in pixels, from its header.
+
+    Raises:
+        ImageError: as far as the header and the end of the file tell, the picture cannot be read.
+    """
     path = Path(path)
     if path.suffix.lower() == ".exr":
         return _exr_size(_exr_header(path), path)
-    data = _read_bytes(path)
-    if size := _header_size(data):
-        return size
-    height, width = decode_image(data, path).shape[:2]
-    return width, height
+    return _checked_size(_read_bytes(path), path)
 
 
 def write_png(path: Path, array: NDArray[Any], compression: int = 1) -> None:
@@ -186,37 +184,17 @@ def _exr_size(header: dict[str, Any], path: Path) -> tuple[int, int]:
     return width, height
 
 
-def _check_header(data: bytes, path: Path) -> None:
-    size = _header_size(data)
-    if size and not 0 < size[0] * size[1] <= _LARGEST_PIXELS:
-        raise ImageError(
-            f"{path} claims {size[0]} x {size[1]} pixels; 1 to {_LARGEST_PIXELS} pixels are read."
-        )
-
-
-def _header_size(data: bytes) -> tuple[int, int] | None:
-    """(width, height) of a PNG or JPEG from its header; None for other formats or a damaged header."""
-    if data[:8] == b"\x89PNG\r\n\x1a\n" and len(data) >= 24:
-        width, height = struct.unpack(">II", data[16:24])
-        return width, height
-    if data[:2] == b"\xff\xd8":
-        return _jpeg_size(data)
-    return None
-
-
-def _jpeg_size(data: bytes) -> tuple[int, int] | None:
-    """Walks a JPEG's segments to the start-of-frame (ITU-T T.81, annex B)."""
-    position = 2
-    while position + 9 <= len(data) and data[position] == 0xFF:
-        marker = data[position + 1]
-        if marker == 0xFF or marker == 0x01 or 0xD0 <= marker <= 0xD7:
-            position += 1 if marker == 0xFF else 2  # fill byte, or a marker without a length
-            continue
-        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
-            height, width = struct.unpack(">HH", data[position + 5 : position + 9])
-            return width, height
-        position += 2 + struct.unpack(">H", data[position + 2 : position + 4])[0]
-    return None
+def _checked_size(data: bytes, path: Path) -> tuple[int, int]:
+    """(width, height) of a picture that looks whole and not larger than its file can hold."""
+    size = header_size(data)
+    if size is None:
+        raise ImageError(f"{path} is damaged or empty, or no PNG, JPEG, TIFF, HDR or EXR picture.")
+    width, height = size
+    if not 0 < width * height <= min(_LARGEST_PIXELS, len(data) * _PIXELS_PER_BYTE):
+        raise ImageError(f"{path} claims {width} x {height} pixels, which its {len(data)} bytes cannot hold.")
+    if is_cut_short(data):
+        raise ImageError(f"{path} is cut short or damaged; copy or export it again.")
+    return width, height
 
 
 def _read_bytes(path: Path) -> bytes:

@@ -66,21 +66,47 @@ def test_exif_orientation_does_not_turn_a_frame(tmp_path):
     assert image_size(tmp_path / "b.jpg") == (16, 8)
 
 
-def test_a_jpeg_without_its_end_is_refused(tmp_path):
-    write_jpeg(tmp_path / "a.jpg", picture(shape=(64, 64, 3)))
-    data = (tmp_path / "a.jpg").read_bytes()
-    (tmp_path / "a.jpg").write_bytes(data[: len(data) // 2])
-    with pytest.raises(ImageError, match="cut short"):
-        read_image(tmp_path / "a.jpg")
+@pytest.mark.parametrize("name", ["a.png", "a.jpg"])
+def test_a_picture_without_its_end_is_refused(tmp_path, name):
+    write_image(tmp_path / name, picture(shape=(64, 64, 3)))
+    data = (tmp_path / name).read_bytes()
+    for size in (len(data) // 2, len(data) - 3):
+        (tmp_path / name).write_bytes(data[:size])
+        for read in (read_image, image_size):
+            with pytest.raises(ImageError, match="cut short"):
+                read(tmp_path / name)
+    (tmp_path / name).write_bytes(data + b"trailer of a phone")
+    assert read_image(tmp_path / name).shape == (64, 64, 3)
 
 
 def test_a_header_that_claims_a_huge_picture_is_refused_before_memory_is_taken(tmp_path):
     write_png(tmp_path / "a.png", picture())
     data = bytearray((tmp_path / "a.png").read_bytes())
+    whole = bytes(data)
     data[16:24] = b"\0\x0f\xff\xff" * 2
     (tmp_path / "a.png").write_bytes(data)
-    with pytest.raises(ImageError, match="pixels are read"):
+    with pytest.raises(ImageError, match="cannot hold"):
         read_image(tmp_path / "a.png")
+    (tmp_path / "a.png").write_bytes(whole[:33] + b"\x60\0\0\0" + whole[37:])  # length of the next chunk
+    with pytest.raises(ImageError, match="cut short or damaged"):
+        read_image(tmp_path / "a.png")
+
+
+@pytest.mark.parametrize(("suffix", "kind"), [(".tif", np.uint8), (".tif", np.uint16), (".hdr", np.float32)])
+def test_other_formats_are_read_in_rgb_order(tmp_path, suffix, kind):
+    array = picture(np.uint8, (5, 9, 3)).astype(kind)
+    assert cv2.imwrite(str(tmp_path / f"a{suffix}"), array[..., ::-1])
+    again = read_image(tmp_path / f"a{suffix}")
+    assert again.dtype == kind
+    # Radiance HDR shares one exponent between the channels: 8 bits of mantissa for the largest
+    assert np.abs(again.astype(float) - array).max() <= (1 if suffix == ".hdr" else 0)
+    assert image_size(tmp_path / f"a{suffix}") == (9, 5)
+
+
+def test_a_flat_picture_that_packs_well_is_read(tmp_path):
+    for name in ("a.png", "a.jpg"):
+        write_image(tmp_path / name, np.full((2000, 3000, 3), 128, np.uint8))
+        assert read_image(tmp_path / name).shape == (2000, 3000, 3)
 
 
 def test_a_missing_picture_names_its_path(tmp_path):
