@@ -307,8 +307,8 @@ def test_true_maps_under_the_lights_of_portrait_a_score_as_known():
     result = measure(truth, render)
     assert result["missing"] == []
     assert result["views"] == 15
-    # Known from an independent computation, with one scale a channel: 29.4 and 31.1 dB without shadows, 18.5 dB
-    # for the point light, whose shadows are black. The directional pictures hold the formula in half precision.
+    # Known from an independent computation, with one scale a channel: 29.4 and 31.1 dB without shadows, 18.5
+    # dB for the point light, whose shadows are black. The directional pictures are half precision.
     scores = {name: measures["psnr_db"] for name, measures in result["lights"].items()}
     assert scores["env1"] == pytest.approx(29.4, abs=0.1)
     assert scores["env2"] == pytest.approx(31.1, abs=0.1)
