@@ -39,7 +39,7 @@ _ROTATION_TOLERANCE = 1e-4  # poses are commonly written with 6 to 9 digits
 _FLASH_TOLERANCE_M = (
     1e-3  # spread of the flash position in camera axes that still counts as "fixed to the camera"
 )
-_DISTORTION_LENGTHS = (0, 1, 2, 4, 5, 8, 12, 14)  # those of OpenCV, and k1 or k1, k2 alone
+_DISTORTION_LENGTHS = (1, 2, 4, 5, 8)  # OpenCV's without thin prism and tilt, and k1 or k1, k2 alone
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,8 +227,11 @@ def _frame(
         split = "val" if index in splits["val"] else "train"
     if split not in (None, "train", "val"):
         split = None  # other sets ("test", "gt") are neither fitted nor validated on
+    name = entry.text("name", None) or (file.stem if file else f"{index:04d}")
+    if "/" in name or "\\" in name or name in (".", ".."):
+        raise entry.fail(f"the name {name!r} cannot be that of a file.")  # renderings are named by it
     camera = Camera(
-        name=entry.text("name", None) or (file.stem if file else f"{index:04d}"),
+        name=name,
         width=_own_or_shared(entry, shared, "width").integer("width", low=1, high=LARGEST_SIDE),
         height=_own_or_shared(entry, shared, "height").integer("height", low=1, high=LARGEST_SIDE),
         K=_intrinsics(_own_or_shared(entry, shared, "K")),
@@ -257,7 +260,7 @@ def _distortion(fields: Fields) -> NDArray[np.float64]:
         return np.zeros(0)
     if len(distortion) not in _DISTORTION_LENGTHS:
         raise fields.fail(
-            f'"distortion" has {len(distortion)} values; OpenCV\'s order has 4, 5, 8, 12 or 14.'
+            f'"distortion" has {len(distortion)} values; 4, 5 or 8 in the order of OpenCV are read.'
         )
     return distortion
 

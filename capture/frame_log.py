@@ -50,6 +50,7 @@ class FrameLog:
         Raises:
             SessionError: the file is missing or unreadable, or a line before the last is malformed.
         """
+        self.torn_line, self._size, self._lacks_newline = None, 0, False
         try:
             with self.path.open("rb") as file:
                 number = 0

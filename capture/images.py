@@ -133,10 +133,10 @@ def read_exr(path: Path) -> NDArray[np.float32]:
     try:
         with OpenEXR.File(str(path), separate_channels=True) as file:
             planes = {name: channel.pixels for name, channel in file.channels().items()}
+        if {"R", "G", "B"} <= planes.keys():
+            return np.stack([planes[name] for name in "RGB"], axis=-1).astype(np.float32, copy=False)
     except (RuntimeError, ValueError, TypeError, MemoryError) as cause:
         raise ImageError(f"{path} cannot be read as OpenEXR: {_one_line(cause)}.") from cause
-    if {"R", "G", "B"} <= planes.keys():
-        return np.stack([planes[name] for name in "RGB"], axis=-1).astype(np.float32, copy=False)
     if len(planes) == 1:
         return next(iter(planes.values())).astype(np.float32)
     raise ImageError(

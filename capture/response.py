@@ -49,15 +49,8 @@ class Response:
             canonical_transfer(self.transfer)
         if self.stored is None or self.linear is None:
             return
-        if (
-            self.stored.ndim != 1
-            or len(self.stored) < 2
-            or self.linear.shape
-            not in (
-                (len(self.stored),),
-                (len(self.stored), 3),
-            )
-        ):
+        count = self.stored.size
+        if count < 2 or self.stored.ndim != 1 or self.linear.shape not in ((count,), (count, 3)):
             raise ValueError("the table needs two or more entries, with one or three linear values each")
         if not (np.diff(self.stored) > 0).all() or self.stored[0] < 0 or self.stored[-1] > 1:
             raise ValueError("the table's stored values must rise within 0..1")

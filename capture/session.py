@@ -116,8 +116,8 @@ class Session:
                 )
             (path / "frames").mkdir(parents=True, exist_ok=True)
             atomic_write(path / "frames.jsonl", b"")
+            session._write_manifest()  # after all else: a folder with a session.json is a whole session
             session._log.open()
-            session._write_manifest()  # last: a folder with a session.json is a whole session
         except OSError as cause:
             raise SessionError(f"The session {path} cannot be made: {cause.strerror or cause}.") from cause
         return session
@@ -264,7 +264,7 @@ class Session:
         if image.ndim == 2:
             image = np.repeat(image[..., None], 3, axis=2)
         if image.dtype == np.float32:
-            return np.asarray(image, dtype=np.float32)
+            return image
         if self._response is None:
             self._response = load_response(self.calibration_path) or Response(self.info["image"]["transfer"])
         return self._response.to_linear(image)

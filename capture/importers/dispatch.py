@@ -39,23 +39,20 @@ def import_source(
     for path in paths:
         if not path.exists():
             raise SourceError(f"{path} does not exist.")
-    videos = _videos(paths)
-    if videos:
-        from capture.importers.open_camera import import_videos  # imports the video libraries
-
-        return import_videos(videos, out, options, progress)
+    if all(path.is_file() and _is_video(path) for path in paths):
+        return _import_videos(paths, out, options, progress)
     if len(paths) > 1:
-        raise SourceError(
-            "Several sources can only be the videos of one capture; import other sources one by one."
-        )
-    if options.poses is not None:
-        raise SourceError(f"--poses is for videos; {paths[0]} brings its own poses.")
+        raise SourceError("Several sources can only be the videos of one capture; import others one by one.")
     path = paths[0]
     if (file := _posed_file(path)) is not None:
-        is_nerfstudio = "transform_matrix" in _first_frame(file)
-        return (import_nerfstudio if is_nerfstudio else import_posed)(file, out, options, progress)
+        _refuse_poses(options, file)
+        import_file = import_nerfstudio if "transform_matrix" in _first_frame(file) else import_posed
+        return import_file(file, out, options, progress)
     if path.is_dir() and (model := find_colmap_model(path)) is not None:
+        _refuse_poses(options, model)
         return import_colmap(model, out, options, progress)
+    if path.is_dir() and (videos := sorted(filter(_is_video, path.iterdir()))):
+        return _import_videos(videos, out, options, progress)
     raise SourceError(
         f"{path} is no source that can be imported: a folder needs cameras.json, transforms.json, a COLMAP "
         "model (or sparse/0 and images/) or videos; a file must be a .json of these or a video "
@@ -63,18 +60,19 @@ def import_source(
     )
 
 
-def _videos(paths: Sequence[Path]) -> list[Path]:
-    """The videos that the paths name, or that a folder without any other source holds."""
-    if all(path.is_file() and path.suffix.lower() in VIDEO_SUFFIXES for path in paths):
-        return list(paths)
-    if (
-        len(paths) == 1
-        and paths[0].is_dir()
-        and _posed_file(paths[0]) is None
-        and find_colmap_model(paths[0]) is None
-    ):
-        return sorted(path for path in paths[0].iterdir() if path.suffix.lower() in VIDEO_SUFFIXES)
-    return []
+def _import_videos(videos: Sequence[Path], out: Path, options: ImportOptions, progress: Progress) -> Session:
+    from capture.importers.open_camera import import_videos  # loads the video libraries, for videos only
+
+    return import_videos(videos, out, options, progress)
+
+
+def _is_video(path: Path) -> bool:
+    return path.suffix.lower() in VIDEO_SUFFIXES
+
+
+def _refuse_poses(options: ImportOptions, path: Path) -> None:
+    if options.poses is not None:
+        raise SourceError(f"--poses is for videos; {path} brings its own poses.")
 
 
 def _posed_file(path: Path) -> Path | None:

@@ -173,6 +173,8 @@ def with_frame(**changes):
         (with_frame(K=[[-5, 0, 1], [0, 5, 1], [0, 0, 1]]), "frame 1.*focal"),
         (with_frame(K=[[5, 1, 1], [0, 5, 1], [0, 0, 1]]), "frame 1.*skew"),
         (with_frame(distortion=[0.1, 0.2, 0.3]), "frame 1.*distortion"),
+        (with_frame(distortion=[0.1] * 12), "frame 1.*distortion"),
+        (with_frame(name="../0001"), "frame 1.*name"),
         (with_frame(width=0), 'frame 1: "width"'),
         (with_frame(file="a\0b"), "frame 1.*NUL"),
         (content(frames=[]), "empty"),
