@@ -184,8 +184,8 @@ def _placed_after(parts: list[RecordingPart], video: VideoInfo, warnings: list[s
     start, previous_start = start_by_name(video.path), start_by_name(previous.video.path)
     if start is None or previous_start is None:
         warnings.append(
-            f"{video.path.name} was put right behind {previous.video.path.name}; their names do not tell the time "
-            "between them."
+            f"{video.path.name} was put right behind {previous.video.path.name}; their names do not "
+            "tell the time between them."
         )
         gap_s = 0.0
     else:

@@ -163,7 +163,7 @@ def tie_frame_times(
         inside = asked_s[(asked_s > times_s[0] - 1.0) & (asked_s < times_s[-1] + 1.0)]
         if len(inside) < len(asked_s):
             warnings.append(
-                f"{len(asked_s) - len(inside)} of the {len(asked_s)} flashes logged for {name} lie outside of it."
+                f"{len(asked_s) - len(inside)} of {len(asked_s)} flashes logged for {name} lie outside of it."
             )
         flash_times_s += inside.tolist()
     prior = None
