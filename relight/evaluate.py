@@ -12,7 +12,7 @@ from relight.errors import PortraitError
 from relight.lighting import Light
 from relight.measure import Render, Rendering, measure
 from relight.portrait import Portrait, load_portrait
-from relight.render import render_view
+from relight.render import PortraitRenderer
 from relight.stages import Progress, no_progress
 from relight.truth import load_truth
 
@@ -48,9 +48,10 @@ def evaluate(
 
 def portrait_renderer(portrait: Portrait) -> Render:
     """Renders views of a portrait for `measure`."""
+    renderer = PortraitRenderer(portrait)
 
     def render(camera: Camera, lights: dict[str, Light], flash: int | None) -> Rendering:
-        maps, radiances = render_view(portrait, camera, lights, flash=flash)
+        maps, radiances = renderer.view(camera, lights, flash)
         return Rendering(
             albedo=maps.albedo.cpu().numpy(),
             normals_world=maps.normals_world.cpu().numpy(),

@@ -1,0 +1,124 @@
+"""A portrait whose every number is known, a sphere, through `evaluate`."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from capture.cameras import Camera, PosedFrame, PosedSet, save_posed_set
+from capture.images import write_exr, write_png
+from capture.session import Session
+from relight.errors import PortraitError, TruthError
+from relight.evaluate import evaluate
+from relight.measure_table import format_table
+from relight.portrait import Portrait
+from relight.reflectance import Reflectance
+
+RADIUS_M, DISTANCE_M, SIZE = 0.1, 0.5, 96
+ALBEDO = np.array([0.6, 0.4, 0.3])
+C_ROOM = (0.5, 0.5, 0.4)
+TO_LIGHT = np.array([0.6, 0.0, -0.8])
+
+
+def sphere_portrait(count=30_000):
+    i = np.arange(count) + 0.5
+    z, phi = 1 - 2 * i / count, i * np.pi * (3 - np.sqrt(5))
+    radius = np.sqrt(1 - z * z)
+    normals = torch.tensor(
+        np.stack([radius * np.cos(phi), radius * np.sin(phi), z], axis=1), dtype=torch.float32
+    )
+    albedo = torch.tensor(ALBEDO, dtype=torch.float32).expand(count, 3)
+    return Portrait(
+        points=RADIUS_M * normals,
+        normals_world=normals,
+        albedo=albedo,
+        room_radiance=albedo * torch.tensor(C_ROOM),
+        shading=torch.ones(count),
+        confidence=torch.ones(count),
+        albedo_sigma=torch.zeros(count),
+        normal_sigma_rad=torch.zeros(count),
+        residual=torch.zeros(count),
+        spacing=RADIUS_M * np.sqrt(4 * np.pi / count),
+        c_room=C_ROOM,
+        c_flash=(0.1, 0.1, 0.1),
+        flash_offset_cam_m=(0.0, 0.0, 0.0),
+        reflectance=Reflectance(),
+        info={},
+    )
+
+
+def sphere_camera(name):
+    cam_from_world = np.eye(4)
+    cam_from_world[2, 3] = DISTANCE_M
+    focal = 1.8 * SIZE
+    intrinsics = np.array([[focal, 0, SIZE / 2], [0, focal, SIZE / 2], [0, 0, 1]])
+    return Camera(name, SIZE, SIZE, intrinsics, cam_from_world, flash=0)
+
+
+def write_truth(folder):
+    """What the camera sees of the sphere, by intersecting its rays."""
+    camera = sphere_camera("0000")
+    v, u = np.mgrid[:SIZE, :SIZE] + 0.5
+    rays = np.stack([u, v, np.ones_like(u)], axis=-1) @ np.linalg.inv(camera.K).T
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    half = rays[..., 2] * DISTANCE_M
+    root = half**2 - DISTANCE_M**2 + RADIUS_M**2
+    hit = root > 0
+    points = rays * (half - np.sqrt(np.maximum(root, 0)))[..., None] - [0, 0, DISTANCE_M]
+    normals = np.where(hit[..., None], points / RADIUS_M, 0.0)
+    albedo = np.where(hit[..., None], ALBEDO, 0.0)
+    lit = 0.5 + 0.5 * np.maximum(normals @ TO_LIGHT, 0.0)
+    for name in ("mask", "linear", "gt", "relight"):
+        (folder / name).mkdir(parents=True)
+    write_png(folder / "mask" / "0000.png", (255 * hit).astype(np.uint8))
+    write_exr(folder / "linear" / "0000.exr", albedo * C_ROOM)
+    write_exr(folder / "gt" / "albedo_0000.exr", albedo)
+    write_exr(folder / "gt" / "normal_0000.exr", normals)
+    write_exr(folder / "relight" / "side_0000.exr", albedo * lit[..., None])
+    frame = PosedFrame(camera, 0, flash=0, split="val")
+    save_posed_set(PosedSet("sphere", (frame,), "srgb", None, folder), folder / "cameras.json")
+    light = {"name": "side", "kind": "directional", "to_light": TO_LIGHT.tolist(), "ambient": 0.5}
+    (folder / "lights.json").write_text(json.dumps({"lights": [light]}))
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory):
+    path = tmp_path_factory.mktemp("evaluate") / "S"
+    with Session.create(path, source={"kind": "test"}, width=SIZE, height=SIZE) as created:
+        folder = created.portraits_dir / "solve"
+    sphere_portrait().save(folder)
+    metrics = {"total_s": 1.5, "seconds": {"solve": 1.0}, "points": 30_000}
+    (folder / "metrics.json").write_text(json.dumps(metrics))
+    write_truth(path.parent / "truth")
+    return path
+
+
+def test_a_known_sphere_scores_as_its_maps_are_exact(session):
+    result = evaluate(session, session.parent / "truth")
+    assert (result["session"], result["portrait"], result["truth"]) == ("S", "solve", "sphere")
+    assert result["missing"] == []
+    # Albedo and room are constant, so no splat can be wrong; the files are half floats, 1 part in 2048.
+    assert result["captured"]["psnr_db"] > 60
+    assert result["albedo"]["psnr_db"] > 60
+    assert result["albedo"]["scales"] == pytest.approx([1, 1, 1], abs=1e-3)
+    # A pixel is 2.9 mm wide, 1.7 degrees of the sphere where it faces the camera and more at its edge.
+    assert result["normals"]["median_deg"] < 1.5
+    assert result["lights"]["side"]["psnr_db"] > 35
+    # The outline is right to half a pixel of a disk 36 pixels in radius.
+    assert result["mask"]["iou"] > 0.95
+
+
+def test_what_the_fit_took_stands_beside_its_errors(session):
+    result = evaluate(session, session.parent / "truth")
+    assert result["fit"] == {"total_s": 1.5, "seconds": {"solve": 1.0}}
+    assert result["time"]["view_s"] > 0
+    assert "time of the fit" in format_table(result)
+    assert json.loads(json.dumps(result, allow_nan=False)) == result
+
+
+def test_missing_portraits_and_truths_are_named(session, tmp_path):
+    with pytest.raises(PortraitError, match="paper"):
+        evaluate(session, session.parent / "truth", "paper")
+    with pytest.raises(TruthError, match=r"cameras\.json"):
+        evaluate(session, tmp_path)
