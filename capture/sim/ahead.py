@@ -1,6 +1,7 @@
 """Pictures computed a few ahead on all cores, handed out in order.
 
-NumPy and OpenCV release Python's lock in their long loops, so threads are enough; results do not depend on their number.
+NumPy and OpenCV release Python's lock in their long loops, so threads are enough; results do not depend on
+their number.
 """
 
 from __future__ import annotations

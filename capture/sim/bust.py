@@ -22,7 +22,7 @@ _STRAND_GLOSS = 0.014
 
 @dataclass(frozen=True, eq=False)
 class Bust:
-    """Geometry and material of one subject. V vertices: first skin, shirt and hair volume, then eyes, then strands.
+    """Geometry and material of one subject. Vertices: skin, shirt and hair volume, then eyes, then strands.
 
     Attributes:
         vertices: [V, 3] float32, metres, world.
@@ -101,7 +101,7 @@ def build_bust(subject: Subject, cell_mm: float = 2.2, subdivisions: int = 1, st
 
 
 def _deserves_detail(points: np.ndarray, head: HeadShape, hair: HairShape) -> np.ndarray:
-    """Vertices [V] bool of the face, ears, neck and collar: cloth shows no pores, and hair is covered by strands."""
+    """Vertices [V] bool of the skin and the collar: cloth shows no pores, hair is covered by strands."""
     collar = np.abs(head.collar(points)) < 9.0
     return ((points[:, 1] > -150.0) | collar) & (hair.distance(points) > head.distance(points) - 0.5)
 

@@ -1,4 +1,4 @@
-"""A hand-held half circle around the head, as a person walks it with a phone: arc, sway, and the tremor of hands."""
+"""A hand-held half circle around the head, as a person walks it with a phone: arc, sway, tremor."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ class CameraPath:
 
     Attributes:
         duration_s: time of the whole sweep.
-        sweep_deg: azimuth goes from minus to plus half of this (0 = in front of the face, positive = subject's left).
+        sweep_deg: azimuth goes from minus to plus half of this (0 = in front of the face, positive =
+            subject's left).
         distance_m: mean distance from the head's centre; it wanders by about 8 %.
         elevation_deg: mean height of the camera above the head's centre, as an angle.
         tremor: factor on the shaking of the hands; 0 = a rail.
@@ -30,7 +31,7 @@ class CameraPath:
     seed: int = 0
 
     def cam_from_world(self, time_s: float) -> np.ndarray:
-        """[4, 4] pose at a time; before 0 and after the end the phone stays where the sweep begins or ends."""
+        """[4, 4] pose at a time; before 0 and after the end the sweep stands still."""
         part = float(np.clip(time_s / self.duration_s, 0.0, 1.0))
         eased = part - 0.35 * np.sin(2 * np.pi * part) / (2 * np.pi)  # slow at both ends
         azimuth = np.radians(self.sweep_deg) * (eased - 0.5)

@@ -41,7 +41,7 @@ def _sample(
 
 
 def sample_surface(bust: Bust, count: int, rng: np.random.Generator) -> PointCloud:
-    """Exact points on skin, shirt, hair and some strands, with shading normals and sRGB reflectance as colours."""
+    """Exact points on skin, shirt and hair, with shading normals and sRGB reflectance as colours."""
     on_strands = round(count * _STRAND_SHARE) if len(bust.strand_triangles) else 0
     parts = [_sample(bust, bust.solid_triangles, count - on_strands, rng)]
     if on_strands:
@@ -51,9 +51,10 @@ def sample_surface(bust: Bust, count: int, rng: np.random.Generator) -> PointClo
 
 
 def stereo_cloud(bust: Bust, cameras: list[Camera], count: int, rng: np.random.Generator) -> PointCloud:
-    """Points [P, 3] as dense stereo would find them: only what cameras see, with noise, bumps, holes and outliers.
+    """Points as dense stereo finds them: what cameras see, with noise, bumps, holes and outliers.
 
-    Noise of 0.5 mm along the ray of the camera that sees a point best, more at grazing angles; bumps of 0.4 mm; about
+    Noise of 0.5 mm along the ray of the camera that sees a point best, more at grazing angles; bumps of 0.4
+    mm; about
     2 % of the points missing in holes and 1 % of outliers. No normals, no colours.
     """
     exact = sample_surface(bust, round(count * 1.5), rng)

@@ -1,8 +1,8 @@
 """Light from far away: latitude-longitude maps, what a surface receives of them, and what it mirrors.
 
-A map is [H, W, 3] linear radiance with row i, column j at theta = pi (i + .5) / H, phi = 2 pi (j + .5) / W, direction =
-(sin theta sin phi, cos theta, -sin theta cos phi). Tables over directions are octahedral squares (Cigolle et al. 2014):
-no trigonometry is needed to look one up.
+A map is [H, W, 3] linear radiance; row i and column j look towards
+(sin theta sin phi, cos theta, -sin theta cos phi), theta = pi (i + .5) / H, phi = 2 pi (j + .5) / W. Tables over
+directions are octahedral squares (Cigolle et al. 2014), which are looked up without trigonometry.
 """
 
 from __future__ import annotations
@@ -71,7 +71,8 @@ class Environment:
 
     Attributes:
         radiance: [H, W, 3] linear map.
-        diffuse: [S, S, 3] octahedral: radiance of a white Lambertian surface over its normal (irradiance / pi).
+        diffuse: [S, S, 3] octahedral: radiance of a white Lambertian surface over its normal (irradiance /
+            pi).
         mirrored: [S, S, 3] octahedral: mean radiance in skin's lobe around the mirror direction.
         mirrored_wet: [S, S, 3] the same for eyes.
     """

@@ -35,7 +35,8 @@ class Eyes:
 def make_eyes(head: HeadShape) -> Eyes:
     """Both eyes, looking ahead and a little inwards at whoever holds the phone."""
     subject = head.subject
-    meshes, albedos = [], []
+    meshes: list[Mesh] = []
+    albedos = []
     for side in (1.0, -1.0):
         angle = np.linspace(0.0, 0.62 * np.pi, _RINGS)[:, None]
         around = np.linspace(0.0, 2 * np.pi, _SPOKES, endpoint=False)[None, :]

@@ -1,6 +1,7 @@
-"""Hair: a combed volume that hides the scalp, and thousands of ribbons that follow it and leave a soft outline.
+"""Hair: a combed volume that hides the scalp, and thousands of ribbons that soften its outline.
 
-Points are in head millimetres. A ribbon is two triangles a segment, wide across the strand and rolled at random, so
+Points are in head millimetres. A ribbon is two triangles a segment, wide across the strand and rolled at
+random, so
 that the silhouette thins out instead of ending; eyebrows are the same ribbons, short.
 """
 
@@ -78,7 +79,7 @@ class HairShape:
         return result
 
     def _clumps(self, p: np.ndarray) -> np.ndarray:
-        """Relief [P] of locks, drawn out along the combing: noise of a coordinate that is constant along it."""
+        """Relief [P] of locks, drawn out along the combing."""
         across = self._across(p)
         return 1.3 * value_noise(across, 7.0, self.head.subject.seed + 71) + 0.7 * value_noise(
             across, 2.6, self.head.subject.seed + 72
@@ -118,7 +119,15 @@ class HairShape:
 
 @dataclass(frozen=True, eq=False)
 class Strands:
-    """Ribbons in head millimetres: vertices [V, 3], normals [V, 3], tangents [V, 3], albedo [V, 3], triangles [T, 3]."""
+    """Ribbons in head millimetres.
+
+    Attributes:
+        vertices: [V, 3] float32.
+        normals: [V, 3] float32 unit, for shading.
+        tangents: [V, 3] float32 unit, along the strand.
+        albedo: [V, 3] float32 linear reflectance.
+        triangles: [T, 3] int32, seen from the scalp's outside.
+    """
 
     vertices: np.ndarray
     normals: np.ndarray
@@ -239,7 +248,8 @@ def _grow(
     )
     taper = np.sqrt(1.0 - np.linspace(0.0, 0.97, segments + 1))[None, :, None]
     half = 0.5 * width * taper * rng.uniform(0.6, 1.3, (count, 1, 1))
-    # Both edges of a segment's end share the facing, bent towards its edge: the ribbon shades like a round lock.
+    # Both edges of a segment's end share the facing, bent towards its edge: the ribbon shades like a round
+    # lock.
     edges = np.stack([path - half * across, path + half * across], axis=2)
     shading = np.stack([facing - 0.5 * across, facing + 0.5 * across], axis=2)
     shading /= np.linalg.norm(shading, axis=-1, keepdims=True)

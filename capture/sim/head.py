@@ -1,8 +1,8 @@
 """The shape of a head, neck and shoulders as one implicit surface, sculpted from smooth unions.
 
-Head frame, in MILLIMETRES: +Y up, +Z where the face looks, +X the subject's left, origin midway between the eyes'
-height and the middle of the skull (so that the head spans about y = -118 .. 115). The rest of the rig uses the same
-axes in metres. The body is mirrored in x and then bent a little by a smooth noise, as faces are.
+Head frame, in MILLIMETRES: +Y up, +Z where the face looks, +X the subject's left, the origin between the
+eyes' height and the middle of the skull (the head spans about y = -118 .. 115). The rest of the rig uses the same
+axes in metres. The body is mirrored in x and then bent a little, as faces are.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class HeadShape:
         return folded
 
     def unfold(self, points: np.ndarray) -> np.ndarray:
-        """Where points of the symmetric head, x of either sign, really are: `fold` undone, to a few hundredths of a mm."""
+        """Where points of the symmetric head (x of either sign) really are: `fold` undone, to 0.05 mm."""
         real = np.array(points, dtype=np.float32)
         real[:, 0] *= self._width(real[:, 1])
         real[:, :2] -= self._asymmetry(real)
@@ -74,12 +74,13 @@ class HeadShape:
         return smooth_step(self._skin(q) - self._shirt(q), -0.6, 0.6)
 
     def collar(self, points: np.ndarray) -> np.ndarray:
-        """Distance [P] from the shirt's neckline, positive on the shirt's side; far positive above the neck."""
+        """Distance [P] from the neckline, positive on the shirt's side; far positive above the neck."""
         q = self.fold(points)
         return np.where(q[:, 1] < -100.0, self._below_collar(q), 1e3)
 
     def _skin(self, q: np.ndarray) -> np.ndarray:
-        # The neck and the body are far from most points of the face and the other way round: skip what cannot touch.
+        # The neck and the body are far from most points of the face and the other way round: skip what
+        # cannot touch.
         result = np.empty(len(q), dtype=np.float32)
         face = q[:, 1] > -60.0
         below = q[:, 1] < -175.0
@@ -126,7 +127,7 @@ class HeadShape:
         return result
 
     def _lid_margins(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Heights [P] above the upper and below the lower lid's edge, and depth in front of the eye's centre."""
+        """Heights [P] above the upper lid's edge and below the lower's, and depth before the eye's centre."""
         e = q - np.array(EYE_CENTRE, np.float32)
         level = e[:, 1] - 0.07 * e[:, 0]
         u = np.clip(e[:, 0] / 13.8, -1.4, 1.4)
@@ -256,7 +257,7 @@ class HeadShape:
         return smooth_subtract(self._torso(q), ellipsoid(q, (0, -196, 33), (9, 10, 12)), 18)
 
     def _below_collar(self, q: np.ndarray) -> np.ndarray:
-        """Distance [P] below the collar's seam, positive on the shirt's side: low in front, high at the nape."""
+        """Distance [P] below the neckline, which is low in front and high at the nape."""
         drop = -q[:, 1] - 0.5 * (q[:, 2] + 60.0) - 146.0
         side = q[:, 0] - 42.0
         return (drop + 0.45 * (side + np.sqrt(side * side + 900.0))) * np.float32(0.7)

@@ -1,8 +1,10 @@
 """From a signed distance to a triangle mesh: sparse surface nets, subdivision, projection, vertex normals.
 
-Surface nets: one vertex in each grid cell that the surface crosses (the mean of the crossings of its edges), one
+Surface nets: one vertex in each grid cell that the surface crosses (the mean of the crossings of its edges),
+one
 quad around each grid edge that it crosses. Only blocks near the surface are ever evaluated.
-Source: Gibson 1998, Constrained Elastic Surface Nets (without the relaxation: vertices are projected instead).
+Source: Gibson 1998, Constrained Elastic Surface Nets (without the relaxation: vertices are projected
+    instead).
 """
 
 from __future__ import annotations
@@ -56,7 +58,8 @@ def _active_blocks(distance: Distance, lower: np.ndarray, upper: np.ndarray, cel
     for per_block in (4, 2, 1):
         size = cell * _BLOCK * per_block
         centres = (lower + (blocks + 0.5) * size).astype(np.float32)
-        # 0.87 = half the diagonal of a unit cube; the margin covers smooth unions, whose slope may pass 1, and ears.
+        # 0.87 = half the diagonal of a unit cube; the margin covers smooth unions, whose slope may pass 1,
+        # and ears.
         blocks = blocks[np.abs(distance(centres)) < 0.87 * 1.8 * size]
         if per_block > 1:
             blocks = (blocks[:, None, :] * 2 + _CORNERS).reshape(-1, 3)
@@ -128,7 +131,7 @@ def _quads(keys: np.ndarray, cells: np.ndarray, around: np.ndarray) -> np.ndarra
 
 
 def subdivide(mesh: Mesh, chosen: np.ndarray) -> Mesh:
-    """Triangles between chosen vertices ([V] bool) into four, their neighbours into two, so that no gap opens.
+    """Triangles between chosen vertices ([V] bool) into four, their neighbours into two: no gap opens.
 
     An edge is split at its middle when both its ends are chosen. The first V vertices stay what they were.
     """

@@ -1,6 +1,7 @@
 """Triangles to pixels: a thin layer over OpenCV's software rasteriser, in the rig's own conventions.
 
-World coordinates in metres, OpenCV camera axes, pixel (0, 0) covers [0, 1) x [0, 1): attributes and depth are those
+World coordinates in metres, OpenCV camera axes, pixel (0, 0) covers [0, 1) x [0, 1): attributes and depth
+are those
 of the pixel's centre, interpolated with perspective. This is not the rasteriser that the fit uses.
 """
 
@@ -35,7 +36,7 @@ def rays_world(camera: Camera) -> np.ndarray:
 
 
 def _opengl_camera(camera: Camera) -> tuple[np.ndarray, float]:
-    """Affine map [4, 4] into OpenCV's OpenGL-like camera, which is centred and has one focal length; and its fovy."""
+    """Affine map [4, 4] into OpenCV's OpenGL-like camera (centred, one focal length), and its fovy."""
     focal = camera.K[1, 1]
     shear = np.array(
         [
@@ -79,7 +80,8 @@ class Raster:
 
         Args:
             vertices: [V, 3] float32, world.
-            triangles: [T, 3] int32, counter-clockwise seen from outside (their backs are not drawn); any that crosses the camera's plane must have been left out.
+            triangles: [T, 3] int32, counter-clockwise seen from outside (their backs are not drawn); any
+                that crosses the camera's plane must have been left out.
             attributes: [V, 3] float32 interpolated over the triangles; None draws depth alone.
         """
         matrix, fov_y = _opengl_camera(self.camera)

@@ -1,4 +1,6 @@
-"""The rig put together: a sitter in a room, a phone that moves, a lamp that blinks; frames are pulled one by one.
+"""The rig put together: a sitter in a room, a phone that moves, a lamp that blinks.
+
+Frames are made as they are asked for:
 
 rig = Rig.build(RigConfig())
 for frame in rig.frames():
@@ -8,7 +10,7 @@ for frame in rig.frames():
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -16,11 +18,10 @@ import numpy as np
 from capture.cameras import Camera
 from capture.sim.ahead import computed_ahead
 from capture.sim.bust import Bust, build_bust
-from capture.sim.camera_path import CameraPath
+from capture.sim.config import RigConfig
 from capture.sim.environment import Environment, SoftBox, studio_map
-from capture.sim.lamp import LampConfig, PulseTrain
-from capture.sim.room import Room
-from capture.sim.sensor import SensorConfig
+from capture.sim.lamp import PulseTrain
+from capture.sim.room import PANORAMA_ROWS, Room
 from capture.sim.shading import (
     draw_layer,
     environment_diffuse,
@@ -28,12 +29,12 @@ from capture.sim.shading import (
     facing_vertices,
     point_light,
 )
-from capture.sim.subject import Subject
 from capture.sim.visibility import BroadShadows
 
 Progress = Callable[[str, float], None]
 
-# Novel lights for measuring, in the units of the room: white in the room's light is about `RigConfig.room_level`.
+# Novel lights for measuring, in the units of the room: white in the room's light is about
+# `RigConfig.room_level`.
 _STUDIO = studio_map(
     (0.10, 0.11, 0.13),
     (0.05, 0.045, 0.04),
@@ -48,101 +49,6 @@ _SUNSET = studio_map(
     (0.10, 0.07, 0.05),
     (SoftBox((-0.8, 0.25, 0.75), 0.33, (4.6, 2.4, 1.0)), SoftBox((0.3, 0.9, 0.2), 0.8, (0.12, 0.16, 0.26))),
 )
-
-
-@dataclass(frozen=True)
-class RigConfig:
-    """Everything that can be set. The defaults are the demo.
-
-    Attributes:
-        subject: who sits there.
-        room_seed: of wallpaper, books and pictures.
-        width: of the upright picture, pixels.
-        height: of the upright picture, pixels.
-        focal_px: focal length, pixels.
-        fps: nominal frame rate.
-        path: the hand's motion; its duration is the recording's.
-        lamp: the flash and its timer.
-        sensor: rolling shutter, noise and drift.
-        flash_offset_cam_m: [3] flash position in the axes of the stored pictures' camera.
-        flash_color: [3] C_flash; a Lambertian pixel is albedo * C_flash / d^2 * cosine.
-        room_level: radiance of a white surface that faces the front of the room.
-        rotation_deg: clockwise turn from the stored picture to the upright one: 0, 90, 180, 270.
-        posed_frames: number of frames of a posed set.
-        flash_every: every so many frames of a posed set have the flash on.
-        validation_views: extra cameras with ground truth beside a video.
-        cloud_points: points in the simulated dense cloud.
-        cell_mm: grid of the sculpted mesh; the face's is finer by 2 ** subdivisions.
-        subdivisions: see `cell_mm`.
-        strands: hair ribbons.
-        shadow_directions: depth maps for the broad shadows of room and environments.
-        supersampling: samples along each side of a pixel.
-        codec: "h264" or "hevc".
-        color_range: "limited" or "full".
-        matrix: "bt601" or "bt709".
-        start: local time in the video's name, yyyymmdd_hhmmss.
-    """
-
-    subject: Subject = field(default_factory=Subject)
-    room_seed: int = 0
-    width: int = 480
-    height: int = 640
-    focal_px: float = 690.0
-    fps: float = 30.0
-    path: CameraPath = field(default_factory=CameraPath)
-    lamp: LampConfig = field(default_factory=LampConfig)
-    sensor: SensorConfig = field(default_factory=SensorConfig)
-    flash_offset_cam_m: tuple[float, float, float] = (0.013, -0.007, 0.0)
-    flash_color: tuple[float, float, float] = (0.235, 0.228, 0.215)
-    room_level: float = 0.55
-    rotation_deg: int = 0
-    posed_frames: int = 60
-    flash_every: int = 5
-    validation_views: int = 10
-    cloud_points: int = 120_000
-    cell_mm: float = 2.2
-    subdivisions: int = 1
-    strands: int = 9000
-    shadow_directions: int = 128
-    supersampling: int = 2
-    codec: str = "h264"
-    color_range: str = "limited"
-    matrix: str = "bt709"
-    start: str = "20261102_101530"
-
-    def __post_init__(self) -> None:
-        if self.rotation_deg not in (0, 90, 180, 270):
-            raise ValueError(f"rotation_deg {self.rotation_deg} must be 0, 90, 180 or 270")
-        if self.width % 2 or self.height % 2 or min(self.width, self.height) < 16:
-            raise ValueError(f"{self.width} x {self.height}: both sides must be even and at least 16 pixels")
-
-    @classmethod
-    def from_seed(cls, seed: int) -> RigConfig:
-        """Another person in another room, filmed by another hand; seed 0 is the default."""
-        return cls(
-            subject=Subject.from_seed(seed),
-            room_seed=seed,
-            path=CameraPath(seed=seed),
-            lamp=LampConfig(seed=seed),
-            sensor=SensorConfig(seed=seed),
-        )
-
-    @classmethod
-    def small(cls) -> RigConfig:
-        """A coarse head in small pictures: for tests, a few seconds in all."""
-        return cls(
-            width=128,
-            height=160,
-            focal_px=175.0,
-            path=CameraPath(duration_s=2.4),
-            posed_frames=12,
-            validation_views=2,
-            cloud_points=4000,
-            cell_mm=5.0,
-            subdivisions=0,
-            strands=500,
-            shadow_directions=24,
-        )
 
 
 @dataclass(frozen=True)
@@ -248,18 +154,19 @@ class Rig:
         say = progress or (lambda step, part: None)
         say("furnish the room", 0.0)
         room = Room.build(config.room_seed, config.room_level)
-        lights = [Environment.from_map(map_) for map_ in (room.panorama(64), _STUDIO, _SUNSET)]
+        room_light = Environment.from_map(room.panorama(PANORAMA_ROWS))
+        studio, sunset = Environment.from_map(_STUDIO), Environment.from_map(_SUNSET)
         say("sculpt the head", 0.2)
         bust = build_bust(config.subject, config.cell_mm, config.subdivisions, config.strands)
         say("trace shadows", 0.7)
-        shadows = BroadShadows.trace(bust, lights, config.shadow_directions)
-        diffuse = environment_diffuse(bust, lights[0], shadows.passed[0])
+        shadows = BroadShadows.trace(bust, [room_light, studio, sunset], config.shadow_directions)
+        diffuse = environment_diffuse(bust, room_light, shadows.passed[0])
         pulses = PulseTrain.schedule(config.lamp, config.path.duration_s)
         say("rig ready", 1.0)
-        return cls(config, bust, room, *lights, shadows.passed, diffuse, pulses)
+        return cls(config, bust, room, room_light, studio, sunset, shadows.passed, diffuse, pulses)
 
     def camera(self, time_s: float, name: str, flash: int | None = None) -> Camera:
-        """The phone's camera at a time of the recording; the stored (sensor) picture's, so turned by the rotation."""
+        """The phone's camera at a time of the recording, that of the stored picture."""
         return self.camera_at(self.config.path.cam_from_world(time_s), name, flash)
 
     def camera_at(self, upright_cam_from_world: np.ndarray, name: str, flash: int | None = None) -> Camera:

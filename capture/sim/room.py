@@ -1,7 +1,9 @@
-"""The room behind the sitter: papered walls, furniture and pictures, a window and a lamp, with their light baked in.
+"""The room behind the sitter: walls, furniture, pictures, a window and a lamp, with the light baked in.
 
-A room is a list of rectangles. Their textures lie in one atlas; the light that they receive from window and lamp is
-computed once on a coarse grid and multiplied in. What the sitter receives of the room is the panorama seen from the
+A room is a list of rectangles. Their textures lie in one atlas; the light that they receive from window and
+lamp is
+computed once on a coarse grid and multiplied in. What the sitter receives of the room is the panorama seen
+from the
 middle of the head.
 """
 
@@ -14,143 +16,17 @@ import numpy as np
 
 from capture.cameras import Camera
 from capture.sim.environment import latlong_directions
+from capture.sim.furniture import Panel, furnish
 from capture.sim.rasterize import Raster, project
-from capture.sim.room_textures import (
-    Texture,
-    bookshelf_texture,
-    carpet_texture,
-    plain_texture,
-    poster_texture,
-    wallpaper_texture,
-    window_texture,
-    wood_texture,
-)
 
+PANORAMA_ROWS = 64  # of the map that lights the sitter
 _PATCH_M = 0.25  # side of the triangles' squares
 _ATLAS_WIDTH = 2048
 _AMBIENT = 0.9  # light that has bounced often, relative to the direct light's mean over the panels
 
 
-@dataclass(frozen=True, eq=False)
-class Panel:
-    """A textured rectangle; its front is the side from which u x v points at the viewer.
-
-    Attributes:
-        corner: [3] metres; where the texture's first row and column are.
-        u: [3] edge along the texture's columns, metres.
-        v: [3] edge along its rows, metres.
-        texture: [h, w, 3] linear reflectance, or radiance when glowing.
-        glowing: it emits its texture instead of reflecting light.
-    """
-
-    corner: np.ndarray
-    u: np.ndarray
-    v: np.ndarray
-    texture: np.ndarray
-    glowing: bool = False
-
-    @property
-    def normal(self) -> np.ndarray:
-        """[3] unit, towards the viewer."""
-        n = np.cross(self.v, self.u)
-        return n / np.linalg.norm(n)
-
-    def grid(self, rows: int, columns: int) -> np.ndarray:
-        """[rows, columns, 3] points, from corner to corner."""
-        a = np.linspace(0.0, 1.0, columns)[None, :, None]
-        b = np.linspace(0.0, 1.0, rows)[:, None, None]
-        return self.corner + a * self.u + b * self.v
-
-
-def _rectangle(corner: tuple, u: tuple, v: tuple, texture: Texture, texel_m: float, **kind: bool) -> Panel:
-    edge_u, edge_v = np.array(u, float), np.array(v, float)
-    columns = max(8, round(np.linalg.norm(edge_u) / texel_m))
-    rows = max(8, round(np.linalg.norm(edge_v) / texel_m))
-    return Panel(np.array(corner, float), edge_u, edge_v, texture(rows, columns), **kind)
-
-
-def _box(low: tuple, high: tuple, front: Texture, side: Texture) -> list[Panel]:
-    """Visible faces of a cupboard: front (+z), both sides and the top."""
-    (x0, y0, z0), (x1, y1, z1) = low, high
-    return [
-        _rectangle((x0, y1, z1), (x1 - x0, 0, 0), (0, y0 - y1, 0), front, 0.003),
-        _rectangle((x1, y1, z1), (0, 0, z0 - z1), (0, y0 - y1, 0), side, 0.004),
-        _rectangle((x0, y1, z0), (0, 0, z1 - z0), (0, y0 - y1, 0), side, 0.004),
-        _rectangle((x0, y1, z0), (x1 - x0, 0, 0), (0, 0, z1 - z0), side, 0.004),
-    ]
-
-
-def furnish(seed: int) -> list[Panel]:
-    """The panels of a room of 3.2 x 2.5 x 3.6 m around the head at the origin."""
-    rng = np.random.default_rng(seed + 5000)
-
-    def below(value: int) -> int:
-        return int(rng.integers(value))
-
-    paper, wood, dark = (
-        wallpaper_texture(below(99)),
-        wood_texture(below(99), 0.9),
-        wood_texture(below(99), 0.45),
-    )
-    left, right, floor, ceiling, back, front = -1.6, 1.6, -1.25, 1.25, -1.6, 2.0
-    wide, deep, high = right - left, front - back, ceiling - floor
-    panels = [
-        _rectangle((left, ceiling, back), (wide, 0, 0), (0, -high, 0), paper, 0.004),
-        _rectangle((right, ceiling, back), (0, 0, deep), (0, -high, 0), paper, 0.004),
-        _rectangle((left, ceiling, front), (0, 0, -deep), (0, -high, 0), paper, 0.004),
-        _rectangle((right, ceiling, front), (-wide, 0, 0), (0, -high, 0), paper, 0.012),
-        _rectangle((left, floor, back), (wide, 0, 0), (0, 0, deep), carpet_texture(below(99)), 0.008),
-        _rectangle(
-            (left, ceiling, front), (wide, 0, 0), (0, 0, -deep), plain_texture((0.7, 0.68, 0.64)), 0.012
-        ),
-        _rectangle(
-            (right - 0.01, 1.0, 0.25),
-            (0, 0, 1.1),
-            (0, -1.25, 0),
-            window_texture(below(99)),
-            0.004,
-            glowing=True,
-        ),
-        _rectangle(
-            (-0.5, ceiling - 0.01, 1.2),
-            (0.7, 0, 0),
-            (0, 0, -0.4),
-            plain_texture((2.1, 1.75, 1.3)),
-            0.02,
-            glowing=True,
-        ),
-    ]
-    books = bookshelf_texture(below(99))
-    panels += _box((left + 0.1, floor, back), (left + 1.05, 0.72, back + 0.28), books, dark)
-    panels += _box((0.35, floor, back), (1.35, -0.42, back + 0.4), wood, wood)
-    panels += _box(
-        (0.55, -0.42, back + 0.05), (0.72, -0.16, back + 0.22), plain_texture((0.35, 0.12, 0.07)), dark
-    )
-    panels += [
-        _rectangle((0.25, 0.75, back + 0.01), (0.6, 0, 0), (0, -0.8, 0), poster_texture(below(99)), 0.003)
-    ]
-    panels += [
-        _rectangle((1.0, 0.55, back + 0.01), (0.42, 0, 0), (0, -0.55, 0), poster_texture(below(99)), 0.003)
-    ]
-    panels += [
-        _rectangle((right - 0.01, 0.7, -1.3), (0, 0, 0.75), (0, -0.55, 0), poster_texture(below(99)), 0.003)
-    ]
-    panels += [
-        _rectangle((left + 0.01, 0.62, 1.35), (0, 0, -0.7), (0, -0.9, 0), poster_texture(below(99)), 0.003)
-    ]
-    panels += [
-        _rectangle((left + 0.01, 0.75, 0.3), (0, 0, -0.5), (0, -0.65, 0), poster_texture(below(99)), 0.003)
-    ]
-    panels += [
-        _rectangle((left + 0.012, 0.0, 0.15), (0, 0, -0.34), (0, -0.42, 0), poster_texture(below(99)), 0.003)
-    ]
-    panels += [_rectangle((left + 0.02, -0.52, 1.5), (0, 0, -1.5), (0, -0.75, 0), wood, 0.004)]
-    panels += [_rectangle((right - 0.02, -0.55, -1.45), (0, 0, 1.5), (0, -0.7, 0), dark, 0.004)]
-    return panels
-
-
 def _received(panel: Panel, lights: list[Panel], rows: int, columns: int) -> np.ndarray:
-    """Direct irradiance / pi [rows, columns, 3] of a panel from the glowing ones, without shadows between furniture."""
+    """Direct irradiance / pi [rows, columns, 3] from the glowing panels; furniture casts no shadow."""
     points = panel.grid(rows, columns)
     total = np.zeros((rows, columns, 3))
     for light in lights:
@@ -191,7 +67,7 @@ class Room:
 
     @classmethod
     def build(cls, seed: int, level: float) -> Room:
-        """A furnished room, its light scaled so that a white surface facing the front receives `level` (pi-scaled)."""
+        """A furnished room; at the origin a white surface that faces its front has the radiance `level`."""
         panels = furnish(seed)
         lights = [panel for panel in panels if panel.glowing]
         radiances, albedos = [], []
@@ -208,9 +84,9 @@ class Room:
             radiances.append(panel.texture * light)
             albedos.append(panel.texture)
         room = cls._assemble(panels, radiances, albedos)
-        directions, solid = latlong_directions(32, 64)
+        directions, solid = latlong_directions(PANORAMA_ROWS, 2 * PANORAMA_ROWS)
         facing = np.maximum(directions[..., 2], 0.0) * solid
-        seen = (room.panorama(32) * facing[..., None]).sum((0, 1)).mean() / np.pi
+        seen = (room.panorama(PANORAMA_ROWS) * facing[..., None]).sum((0, 1)).mean() / np.pi
         return cls(
             room.vertices,
             room.normals,
@@ -298,7 +174,7 @@ class Room:
 
 
 def _pack(shapes: list[tuple[int, int]]) -> tuple[list[tuple[int, int]], tuple[int, int]]:
-    """Places (row, column) of rectangles in an atlas, laid in shelves from the tallest, and the atlas's shape."""
+    """Places (row, column) of rectangles laid in shelves from the tallest, and the atlas's shape."""
     places = [(0, 0)] * len(shapes)
     row = column = shelf = 0
     for i in sorted(range(len(shapes)), key=lambda k: -shapes[k][0]):

@@ -1,4 +1,4 @@
-"""Procedural textures of the room: full of corners and detail, as structure from motion needs, yet quiet to look at."""
+"""Procedural textures of the room: full of corners, as structure from motion needs, yet quiet."""
 
 from __future__ import annotations
 

@@ -1,6 +1,7 @@
 """Signed distances (negative inside) and their smooth unions: the clay that the head is sculpted from.
 
-All functions take points [P, 3] and return [P] in the unit of the points. An ellipsoid's distance is the usual
+All functions take points [P, 3] and return [P] in the unit of the points. An ellipsoid's distance is the
+usual
 first-order approximation; it is exact on the surface, which is all that the mesher needs.
 """
 
@@ -32,7 +33,7 @@ def ellipsoid(points: np.ndarray, centre: Vector, radii: Vector) -> np.ndarray:
 
 
 def round_cone(points: np.ndarray, start: Vector, end: Vector, radii: tuple[float, float]) -> np.ndarray:
-    """Distance to a capsule whose radius goes linearly from `radii[0]` to `radii[1]` (good for mild tapers)."""
+    """Distance to a capsule whose radius goes from `radii[0]` to `radii[1]` (good for mild tapers)."""
     axis = _vector(end) - _vector(start)
     offset = points - _vector(start)
     along = np.clip(offset @ axis / np.float32(axis @ axis), 0.0, 1.0)

@@ -1,4 +1,4 @@
-"""From radiance to the numbers in the file: noise, black level, analogue-digital conversion, drift, transfer, clipping."""
+"""From radiance to the numbers in the file: noise, black level, conversion, drift, transfer, clipping."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import numpy as np
 
 from capture.transfer import to_display
 
-_ADC_STEPS = 1023
-_BLACK_STEPS = 64
+_ADC_STEPS = 4095  # 12 bits
+_BLACK_STEPS = 256
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class SensorConfig:
         )
 
     def linear(self, radiance: np.ndarray, index: int) -> np.ndarray:
-        """Noisy, converted, clipped linear signal [H, W, 3] of a frame: its noise depends on seed and index alone."""
+        """Noisy, converted, clipped linear signal [H, W, 3]; its noise depends on seed and index alone."""
         signal = radiance.astype(np.float32)
         if self.noise:
             rng = np.random.default_rng([self.seed, 3, index])

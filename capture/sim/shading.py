@@ -3,8 +3,10 @@
     L = albedo * (room irradiance / pi) + gloss of the room
       + F * (C_flash / d^2) * max(0, <n, l>) * visible * (albedo + gloss lobe)
 
-Diffuse light is the fit's own model (Sevastopolsky et al. 2020, eqs. 1-7); gloss, cast shadows and their penumbrae are
-what the fit does not know. Vertices lie about one pixel apart, so interpolated vertex radiance is as sharp as the picture.
+Diffuse light is the fit's own model (Sevastopolsky et al. 2020, eqs. 1-7); gloss, cast shadows and their
+penumbrae are
+what the fit does not know. Vertices lie about one pixel apart, so interpolated vertex radiance is as sharp
+as the picture.
 """
 
 from __future__ import annotations
@@ -96,7 +98,7 @@ def point_light(
 
 
 def _lobe(bust: Bust, chosen: np.ndarray, normals: np.ndarray, half: np.ndarray) -> np.ndarray:
-    """Blinn-Phong lobe [C], normalised to keep energy and times pi; around the strand for hair (Kajiya-Kay 1989)."""
+    """Blinn-Phong lobe [C], energy-conserving, times pi; around the strand for hair (Kajiya-Kay 1989)."""
     exponent = np.where(bust.wet[chosen], np.float32(_WET_EXPONENT), np.float32(_SKIN_EXPONENT))
     cosine = np.clip(np.einsum("vc,vc->v", half, normals), 0.0, 1.0)
     strand = chosen >= bust.strand_start

@@ -1,4 +1,4 @@
-"""The two captures that the rig can make: a posed image set, and a phone's video; both with their truth beside them."""
+"""The two captures that the rig makes: a posed image set and a phone's video, with the truth beside them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ import numpy as np
 from capture.atomic import atomic_write
 from capture.cameras import Camera
 from capture.sim.ahead import computed_ahead
-from capture.sim.rig import Progress, Rig, RigConfig
+from capture.sim.config import RigConfig
+from capture.sim.rig import Progress, Rig
 from capture.sim.truth import write_cameras, write_clouds, write_frame, write_lights, write_view
 from capture.video.writer import VideoWriter
 
@@ -28,7 +29,7 @@ def _nothing(step: str, part: float) -> None:
 def simulate_posed_set(
     out: Path, config: RigConfig, progress: Progress | None = None, rig: Rig | None = None
 ) -> Path:
-    """Writes a posed image set with truth: every frame fully lit or not at all, noisy 8-bit frames, a noisy cloud.
+    """Writes a posed image set with truth: noisy 8-bit frames, each fully lit or not at all; a noisy cloud.
 
     Args:
         out: folder to write into; made when missing.
@@ -44,7 +45,7 @@ def simulate_posed_set(
     out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
     cameras, entries = [], []
-    lit = {i for i in range(0, config.posed_frames, config.flash_every)}
+    lit = set(range(0, config.posed_frames, config.flash_every))
     probes = {i for i in lit if (i // config.flash_every) % 4 == 2 and i + 1 < config.posed_frames}
     validation = {i + step for i in probes for step in (-1, 0, 1)}
     measured = validation | set(range(0, config.posed_frames, 10))
@@ -80,8 +81,10 @@ def simulate_video(
 ) -> Path:
     """Writes a phone's video `VID_yyyymmdd_hhmmss.mp4` of the rig, with poses, cloud and truth beside it.
 
-    cameras.json has an entry with `pts_s` for each frame of the video (no file); truth.jsonl says for each frame what the
-    lamp really did, truth.json the pulses and the resolved configuration. cameras_val.json are extra cameras near the
+    cameras.json has an entry with `pts_s` for each frame of the video (no file); truth.jsonl says for each
+    frame what the
+    lamp really did, truth.json the pulses and the resolved configuration. cameras_val.json are extra cameras
+    near the
     path, noise-free, alternately without and with flash, with ground truth.
 
     Args:

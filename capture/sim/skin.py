@@ -1,6 +1,7 @@
 """Paint and grain of skin and cloth: reflectance, gloss and the fine relief of pores and weave.
 
-Points are in head millimetres. Reflectances stay in the range of measured skin (about 0.02..0.7, red > green > blue).
+Points are in head millimetres. Reflectances stay in the range of measured skin (about 0.02..0.7, red > green
+> blue).
 """
 
 from __future__ import annotations

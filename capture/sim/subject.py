@@ -8,7 +8,8 @@ import numpy as np
 
 HAIR_STYLES = ("short", "swept", "bob", "bald")
 
-# Linear reflectances, from measured ranges: skin from very light to dark, hair from black to blond, iris colours.
+# Linear reflectances, from measured ranges: skin from very light to dark, hair from black to blond, iris
+# colours.
 _SKIN_TONES = (
     (0.50, 0.335, 0.25),
     (0.45, 0.30, 0.22),

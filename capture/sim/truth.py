@@ -86,8 +86,8 @@ def ground_truth(rig: Rig, camera: Camera) -> GroundTruth:
 def relit(rig: Rig, camera: Camera, truth: GroundTruth) -> dict[str, np.ndarray]:
     """The sitter under each novel light: name to [H, W, 3] radiance.
 
-    Directional ones follow L = A (ambient + (1 - ambient) max(0, <N, l>)); the point light and the environments have
-    shadows and gloss and are premultiplied by coverage.
+    Directional ones follow L = A (ambient + (1 - ambient) max(0, <N, l>)); point light and environments
+    have shadows and gloss and are premultiplied by coverage.
     """
     result = {}
     for name, to_light in DIRECTIONS.items():
@@ -183,7 +183,7 @@ def write_cameras(rig: Rig, path: Path, cameras: list[Camera], entries: list[dic
         "flash": {
             "offset_cam": list(rig.config.flash_offset_cam_m),
             "C_flash": list(rig.config.flash_color),
-            "model": "I_flash = A * C_flash / d^2 * max(0, <N, l>) + gloss, with cast shadows; isotropic point",
+            "model": "A * C_flash / d^2 * max(0, <N, l>) + gloss, with cast shadows; isotropic point",
         },
         "depth": "gt/depth_*.png: uint16, z along the optical axis in units of 0.05 mm, 0 = no head",
         "frames": frames,

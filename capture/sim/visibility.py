@@ -1,6 +1,7 @@
 """Which light reaches which point of the sitter: depth maps seen from the light.
 
-Broad light (room, environments) is blocked per vertex, once: `BroadShadows` looks at the head from many directions.
+Broad light (room, environments) is blocked per vertex, once: `BroadShadows` looks at the head from many
+directions.
 Small lights (flash, point) get one sharp depth map each time: `point_visibility`.
 """
 
@@ -39,7 +40,7 @@ def view_from(position: np.ndarray, target: np.ndarray, reach_m: float, size: in
 
 
 def depth_visibility(raster: Raster, points: np.ndarray, bias_m: float, soft_m: float) -> np.ndarray:
-    """Share of light [P] that passes to points [P, 3]: 1 at the depth map's surface, falling over `soft_m` behind it.
+    """Share of light [P] that reaches points [P, 3]: 1 on the depth map, falling over `soft_m` behind it.
 
     The four texels around the point's projection are compared and weighted (percentage-closer filtering).
     """
