@@ -24,6 +24,7 @@ import time
 from collections.abc import Callable
 from datetime import UTC, datetime
 from importlib.metadata import version
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -93,7 +94,7 @@ def import_once(video: Path, folder: Path) -> dict[str, Any]:
     session = import_videos([video], folder / "S", ImportOptions(), note)
     end = time.perf_counter(), time.process_time()
     marks = [start, began[TAGGING], began[WRITING], end]
-    stages = dict(zip((LOOKING, TAGGING, WRITING), zip(marks, marks[1:], strict=False), strict=True))
+    stages = dict(zip((LOOKING, TAGGING, WRITING), pairwise(marks), strict=True))
     return {
         "frames": len(session.frames),
         "kept": sum(record.file is not None for record in session.frames),

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -39,11 +40,11 @@ class Candidate:
     posed: bool = False
 
 
-def measure_sharpness(luma: NDArray[np.uint8] | NDArray[np.uint16]) -> float:
-    """Mean squared Laplacian over squared mean, of a plane of 0.1 to 1 megapixel; larger is sharper.
+def measure_sharpness(luma: NDArray[Any]) -> float:
+    """Mean squared Laplacian over squared mean of a plane of 0.1 to 1 megapixel, uint8 or uint16.
 
-    The division makes it blind to how strongly the scene is lit. Noise adds the same to all frames of a
-    capture.
+    Larger is sharper. The division makes it blind to how strongly the scene is lit. Noise adds the same to
+    all frames of a capture.
     """
     kind = cv2.CV_16S if luma.dtype == np.uint8 else cv2.CV_32F
     energy = cv2.norm(cv2.Laplacian(luma, kind), cv2.NORM_L2SQR) / luma.size

@@ -68,11 +68,8 @@ def import_videos(
     transfer, transfer_warnings = _choose_transfer(recording, evidence, scene, options)
 
     survey = survey_recording(recording, transfer, progress)
-    pts_s = np.array([frame.pts_s for frame in survey.frames])
-    parts = [
-        pts_s[[frame.part == number for frame in survey.frames]] for number in range(len(recording.parts))
-    ]
-    times = tie_frame_times(recording, evidence, parts)
+    pts_of_parts = [survey.times_of_part(number) for number in range(len(recording.parts))]
+    times = tie_frame_times(recording, evidence, pts_of_parts)
     warnings = [
         *recording.warnings,
         *transfer_warnings,
@@ -80,7 +77,7 @@ def import_videos(
         *survey.problems,
         *times.warnings,
     ]
-    posed = match_poses(scene, pts_s, warnings)
+    posed = match_poses(scene, np.concatenate(pts_of_parts), warnings)
     progress("tagging", 0.0)
     records = blank_records(recording, survey, times, evidence, posed)
     records, tags = tag_records(records, survey, times, options)

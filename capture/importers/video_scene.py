@@ -76,7 +76,7 @@ def match_poses(scene: VideoScene, pts_s: NDArray[np.float64], warnings: list[st
     if not matched:
         raise SourceError(
             f"None of the {len(timed)} poses ({times_s.min():.3f} to {times_s.max():.3f} s) belongs to a "
-            f"frame of the video ({pts_s[0]:.3f} to {pts_s[-1]:.3f} s); their pts_s must be those of the video."
+            f"frame of the video ({pts_s[0]:.3f} to {pts_s[-1]:.3f} s); give the video's own times as pts_s."
         )
     if len(matched) < len(timed):
         warnings.append(f"{len(timed) - len(matched)} of {len(timed)} poses belong to no frame of the video.")

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from capture.errors import SourceError
 from capture.importers.options import Progress
@@ -20,7 +21,14 @@ _SHARPNESS_SIDE = 480  # the plane on which sharpness is measured has at least s
 
 @dataclass(frozen=True, slots=True)
 class SeenFrame:
-    """What is remembered of a frame after the first pass, beside its profile."""
+    """What is remembered of a frame after the first pass, beside its profile.
+
+    Attributes:
+        part: number of the file it is in.
+        pts_s: on the capture's time axis.
+        sharpness: see `capture.selection`.
+        damaged: the decoder patched over missing data.
+    """
 
     part: int
     pts_s: float
@@ -30,18 +38,28 @@ class SeenFrame:
 
 @dataclass(frozen=True, eq=False)
 class Survey:
-    """The first pass."""
+    """The first pass.
+
+    Attributes:
+        frames: all of them, in order of time.
+        profiles: of the undamaged ones.
+        problems: what was wrong with the files, a sentence each.
+    """
 
     frames: list[SeenFrame]
-    profiles: FrameProfiles  # of the undamaged frames
+    profiles: FrameProfiles
     problems: list[str]
+
+    def times_of_part(self, part: int) -> NDArray[np.float64]:
+        """Times of the frames of one file, seconds."""
+        return np.array([frame.pts_s for frame in self.frames if frame.part == part])
 
 
 def survey_recording(recording: Recording, transfer: str, progress: Progress) -> Survey:
     """Looks at every frame of a recording.
 
     Raises:
-        SourceError: no undamaged frame, or parts that overlap.
+        SourceError: no undamaged frame.
     """
     first = recording.parts[0].video
     accumulator = ProfileAccumulator(
@@ -55,14 +73,15 @@ def survey_recording(recording: Recording, transfer: str, progress: Progress) ->
     problems: list[str] = []
     end_s = recording.parts[-1].end_s
     for number, part in enumerate(recording.parts):
-        last_s = frames[-1].pts_s if frames else -np.inf
+        shift_s = part.shift_s
+        if frames and shift_s + part.video.start_s <= frames[-1].pts_s:
+            shift_s = frames[-1].pts_s + part.video.frame_interval_s - part.video.start_s
+            problems.append(
+                f"The file before {part.video.path.name} is longer than it says; this one was put behind its "
+                "last frame."
+            )
         for frame in decode_video(part.video, problems):
-            pts_s = part.shift_s + frame.pts_s
-            if pts_s <= last_s:
-                raise SourceError(
-                    f"{part.video.path.name} starts before {recording.parts[number - 1].video.path.name} "
-                    "ends; they are no consecutive parts of one capture."
-                )
+            pts_s = shift_s + frame.pts_s
             luma, *chroma = full_scale_planes(frame.picture)
             if not frame.damaged:
                 accumulator.add(luma, pts_s, chroma=(chroma[0], chroma[1]))
@@ -76,5 +95,4 @@ def survey_recording(recording: Recording, transfer: str, progress: Progress) ->
 def _sharpness(luma: Pixels) -> float:
     factor = max(1, min(luma.shape) // _SHARPNESS_SIDE)
     size = (luma.shape[1] // factor, luma.shape[0] // factor)
-    small: Pixels = luma if factor == 1 else cv2.resize(luma, size, interpolation=cv2.INTER_AREA)  # type: ignore[assignment]
-    return measure_sharpness(small)
+    return measure_sharpness(luma if factor == 1 else cv2.resize(luma, size, interpolation=cv2.INTER_AREA))
