@@ -40,11 +40,12 @@ from relight.spherical_harmonics import (
     rotation_about_up,
     sh_irradiance,
 )
-from relight.surface import Surface, SurfaceMaps, cosine, cosine_falloff
+from relight.surface import MIN_DISTANCE_M, Surface, SurfaceMaps, cosine, cosine_falloff, direction_to
 from relight.surface import Visibility as Visibility
 
 if TYPE_CHECKING:
     from capture.cameras import Camera
+    from relight.reflectance import Reflectance
 
 Vector = tuple[float, float, float]
 
@@ -59,6 +60,7 @@ def shade(
     flash_offset_cam_m: ArrayLike | Tensor | None = None,
     flash: int | None = None,
     visibility: Visibility | None = None,
+    reflectance: Reflectance | None = None,
 ) -> Tensor:
     """Radiance of the surface under a light, differentiable in the maps and colours.
 
@@ -73,6 +75,7 @@ def shade(
             flash.
         flash: flag F of a captured light; by default the camera's own, and 0 where that is unknown.
         visibility: for shadows; without it nothing is in shadow.
+        reflectance: of the subject, for the flash and point lights; by default it is Lambertian.
 
     Returns:
         [..., 3], linear, not premultiplied, 0 where the mask is 0; float32 or float64 as the maps.
@@ -85,7 +88,7 @@ def shade(
         return torch.zeros_like(maps.albedo)
     if flash is None and camera is not None:
         flash = camera.flash
-    capture = CaptureLight(camera, c_room, c_flash, flash_offset_cam_m, bool(flash))
+    capture = CaptureLight(camera, c_room, c_flash, flash_offset_cam_m, bool(flash), reflectance)
     return surface.scatter(light.radiance(surface, capture))
 
 
@@ -98,9 +101,12 @@ class CaptureLight:
     c_flash: ArrayLike | Tensor | None
     flash_offset_cam_m: ArrayLike | Tensor | None
     flash: bool
+    reflectance: Reflectance | None = None
 
     def room_radiance(self, surface: Surface) -> Tensor:
-        """A C_room s: [P, 3]."""
+        """A C_room s: [P, 3]; or what the maps know of it in colour."""
+        if surface.room_radiance is not None:
+            return surface.room_radiance
         if self.c_room is None:
             raise ValueError("a light with the room in it needs c_room")
         return surface.albedo * surface.vector(self.c_room) * surface.shading
@@ -113,8 +119,17 @@ class CaptureLight:
         if self.flash_offset_cam_m is not None:
             cam_from_world = surface.vector(self.camera.cam_from_world[:3, :3])
             position = position + surface.vector(self.flash_offset_cam_m) @ cam_from_world
-        falloff = cosine_falloff(surface.points, surface.normals, position)
-        return surface.albedo * surface.vector(self.c_flash) * falloff[:, None]
+        return surface.vector(self.c_flash) * self.response(surface, position)
+
+    def response(self, surface: Surface, position: Tensor) -> Tensor:
+        """Radiance [P, 3] under a point light of unit colour at [3], without shadows."""
+        falloff = cosine_falloff(surface.points, surface.normals, position)[:, None]
+        if self.reflectance is None or self.camera is None:
+            return surface.albedo * falloff
+        to_light, distance = direction_to(surface.points, position)
+        to_view, _ = direction_to(surface.points, surface.vector(self.camera.centre_world))
+        response = self.reflectance.response(surface.albedo, surface.normals, to_light, to_view)
+        return response / distance.clamp(min=MIN_DISTANCE_M) ** 2
 
 
 class Light(ABC):
@@ -202,10 +217,11 @@ class PointLight(Light):
 
     def radiance(self, surface: Surface, capture: CaptureLight) -> Tensor:  # noqa: D102
         position = surface.vector(self.position)
-        falloff = cosine_falloff(surface.points, surface.normals, position)
+        radiance = surface.vector(self.C) * capture.response(surface, position)
         if self.shadows:
-            falloff = falloff * surface.sees_point(position)
-        return surface.albedo * surface.vector(self.C) * falloff[:, None]
+            visible = surface.sees_point(position)
+            radiance = radiance * (visible[:, None] if isinstance(visible, Tensor) else visible)
+        return radiance
 
 
 @dataclass(frozen=True, eq=False)

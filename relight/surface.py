@@ -20,7 +20,11 @@ MIN_DISTANCE_M = 1e-3
 
 
 class SurfaceMaps(Protocol):
-    """What can be shaded: maps of a view, [...] = [H, W], or arrays of points, [...] = [P]."""
+    """What can be shaded: maps of a view, [...] = [H, W], or arrays of points, [...] = [P].
+
+    Maps may also have a `room_radiance` [..., 3], linear: what the room's light makes of the surface, in colour. It
+    then takes the place of albedo * C_room * shading.
+    """
 
     @property
     def albedo(self) -> Tensor:
@@ -83,6 +87,12 @@ class Surface:
         return self._gather(self._maps.shading[..., None])
 
     @cached_property
+    def room_radiance(self) -> Tensor | None:
+        """[P, 3], linear, under the room's light; None where the maps know only a grey shading."""
+        radiance = getattr(self._maps, "room_radiance", None)
+        return None if radiance is None else self._gather(radiance)
+
+    @cached_property
     def points(self) -> Tensor:
         """[P, 3], metres, world."""
         return self._gather(self._maps.points_world)
@@ -140,3 +150,10 @@ def cosine_falloff(points: Tensor, normals: Tensor, position: Tensor) -> Tensor:
     towards = position - points
     distance_squared = (towards * towards).sum(dim=-1).clamp(min=MIN_DISTANCE_M**2)
     return (normals * towards).sum(dim=-1).clamp(min=0.0) / distance_squared**1.5
+
+
+def direction_to(points: Tensor, position: Tensor) -> tuple[Tensor, Tensor]:
+    """Unit directions [..., 3] from points [..., 3] to a position [3], and distances [..., 1]; 0 at the point."""
+    towards = position - points
+    distance = torch.linalg.vector_norm(towards, dim=-1, keepdim=True)
+    return towards / distance.clamp(min=1e-12), distance

@@ -1,0 +1,148 @@
+"""What every point of the surface looks like in every frame that sees it.
+
+Occlusion is told from a z-buffer of cells a few points wide: the nearest depth in the 3x3 cells about a point, and a
+tolerance that grows with the slant of the surface across these cells. So no hole between points lets light through
+from behind, and a slanted surface does not hide itself.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from capture.cameras import Camera
+from relight.cloud import SurfaceCloud
+from relight.raster import NEAR_M, project
+from relight.scene import Scene
+from relight.stages import Progress, no_progress
+
+_SLANT = 2.0  # cells between a point and the nearest one of its 3x3 cells
+_GRAZING = 0.1  # cosine below which a frame says little of a point: 84 degrees
+_MASK_MARGIN_PX = 1  # at the edge of the mask a pixel mixes subject and background
+
+
+@dataclass(frozen=True, eq=False)
+class Observations:
+    """Samples of P points in K frames.
+
+    Attributes:
+        radiance: [K, P, 3] float32, linear; 0 where there is none.
+        cosine: [K, P] float32, between normal and direction to the camera; 0 where the frame does not see the point,
+            or sees it clipped or outside the mask.
+        flash: [K] bool.
+        flash_position_world: [K, 3].
+        outside: [P] float32, share of the frames with a mask, of those that have the point in the picture, in which
+            it lies outside the mask: what is off the subject in a frame is not the subject, whether seen or hidden.
+    """
+
+    radiance: torch.Tensor
+    cosine: torch.Tensor
+    flash: torch.Tensor
+    flash_position_world: torch.Tensor
+    outside: torch.Tensor
+
+
+def observe_points(scene: Scene, surface: SurfaceCloud, progress: Progress = no_progress) -> Observations:
+    """Samples all frames of a scene at the points that they see (bilinear, pixel centres at 0.5)."""
+    points = torch.from_numpy(surface.points).to(scene.device)
+    normals = torch.from_numpy(surface.normals_world).to(scene.device)
+    count, total = len(scene.views), len(points)
+    radiance = points.new_zeros(count, total, 3)
+    cosine = points.new_zeros(count, total)
+    off, in_picture = points.new_zeros(total), points.new_zeros(total)
+    for k, view in enumerate(scene.views):
+        observation = scene.observe(view)
+        uv_px, slant, inside = visible_points(points, normals, view.camera, surface.spacing)
+        layers = [observation.radiance.permute(2, 0, 1), observation.valid[None]]
+        if observation.mask is not None:
+            layers.append(_eroded(observation.mask)[None])
+        seen = (slant > _GRAZING).nonzero()[:, 0]
+        samples = sample_bilinear(torch.cat(layers), uv_px[seen])
+        # A clipped or masked neighbour in the bilinear sum already makes it wrong.
+        trusted = (samples[:, 3:] > 0.999).all(dim=1)
+        radiance[k, seen] = torch.where(trusted[:, None], samples[:, :3], 0.0)
+        cosine[k, seen] = torch.where(trusted, slant[seen], 0.0)
+        if observation.mask is not None:
+            coverage = sample_bilinear(_dilated(observation.mask)[None], uv_px)[:, 0]
+            off += inside & (coverage < 0.5)
+            in_picture += inside
+        progress("observe", (k + 1) / count)
+    offset = torch.as_tensor(scene.flash_offset_cam_m, dtype=torch.float64)
+    flash_positions = torch.stack(
+        [
+            torch.from_numpy(view.camera.centre_world + view.camera.cam_from_world[:3, :3].T @ offset.numpy())
+            for view in scene.views
+        ]
+    )
+    return Observations(
+        radiance=radiance,
+        cosine=cosine,
+        flash=torch.tensor([view.flash == 1 for view in scene.views], device=scene.device),
+        flash_position_world=flash_positions.to(points),
+        outside=off / in_picture.clamp(min=1.0),
+    )
+
+
+def visible_points(
+    points: torch.Tensor,
+    normals: torch.Tensor,
+    camera: Camera,
+    spacing: float,
+    *,
+    cell: float = 4.8,
+    tolerance: float = 7.5,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Where points project and how they face a camera that sees them.
+
+    Args:
+        points: [P, 3], world.
+        normals: [P, 3], unit, world.
+        camera: Without distortion.
+        spacing: Of the points, world units.
+        cell: Width of a z-buffer cell in spacings, and at least two pixels. With 4.8 some twenty points fall into a
+            cell and none is empty; smaller ones resolve finer occluders.
+        tolerance: Depth in spacings that does not hide: the noise of a dense cloud stays within 7.5.
+
+    Returns:
+        uv_px [P, 2]; cosine [P] between the normal and the direction to the camera, 0 where the point is hidden, turned
+        away or outside the picture; inside [P] bool, whether it projects into the picture at all.
+    """
+    uv_px, z = project(points, camera)
+    inside = (z > NEAR_M) & (uv_px >= 0).all(dim=1)
+    inside &= (uv_px[:, 0] < camera.width) & (uv_px[:, 1] < camera.height)
+    if not inside.any():
+        return uv_px, torch.zeros_like(z), inside
+    focal_px = float(camera.K[0, 0])
+    cell_px = max(2.0, cell * spacing * focal_px / float(z[inside].median()))
+    columns, rows = int(camera.width / cell_px) + 1, int(camera.height / cell_px) + 1
+    grid = (uv_px / cell_px).nan_to_num(0.0).clamp(0, max(columns, rows)).long()
+    place = (grid[:, 1] * columns + grid[:, 0]).where(inside, 0)
+    nearest = z.new_full((rows * columns,), torch.inf)
+    nearest.scatter_reduce_(0, place[inside], z[inside], "amin")
+    nearest = -torch.nn.functional.max_pool2d(-nearest.view(1, 1, rows, columns), 3, 1, 1).flatten()
+    towards = torch.as_tensor(camera.centre_world).to(points) - points
+    cosine = (normals * towards).sum(dim=1) / torch.linalg.vector_norm(towards, dim=1).clamp(min=1e-12)
+    slope = (1.0 - cosine**2).clamp(min=0.0).sqrt() / cosine.clamp(min=0.15)
+    allowed = tolerance * spacing + _SLANT * cell_px * z / focal_px * slope
+    seen = inside & (cosine > 0) & (z <= nearest[place] + allowed)
+    return uv_px, torch.where(seen, cosine, 0.0), inside
+
+
+def sample_bilinear(image: torch.Tensor, uv_px: torch.Tensor) -> torch.Tensor:
+    """Values [P, C] of an image [C, H, W] at pixel positions [P, 2], centres at 0.5, the border repeated outside."""
+    height, width = image.shape[1:]
+    grid = uv_px / uv_px.new_tensor([width, height]) * 2.0 - 1.0
+    return torch.nn.functional.grid_sample(
+        image[None], grid[None, None], mode="bilinear", padding_mode="border", align_corners=False
+    )[0, :, 0].T
+
+
+def _eroded(mask: torch.Tensor) -> torch.Tensor:
+    """1 where the mask is full in a neighbourhood, below 1 elsewhere."""
+    full = (mask >= 0.99).float()[None, None]
+    return -torch.nn.functional.max_pool2d(-full, 2 * _MASK_MARGIN_PX + 1, 1, _MASK_MARGIN_PX)[0, 0]
+
+
+def _dilated(mask: torch.Tensor) -> torch.Tensor:
+    return torch.nn.functional.max_pool2d(mask[None, None], 3, 1, 1)[0, 0]

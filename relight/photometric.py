@@ -1,0 +1,369 @@
+"""Photometric solve: albedo, normals and room shading of every point from flash and no-flash frames.
+
+With poses and points known the light model (Sevastopolsky 2020, eq. 4) is nearly linear per point. In a no-flash
+frame a point shows its room radiance; a flash frame adds
+
+    q = (L - room) d^2 / C_flash = albedo * diffuse(<n, l>) + gloss(<n, l>)
+
+(`relight.reflectance`), seen under as many light directions l as there are flash frames. The steps:
+
+1. room radiance: robust mean over the no-flash frames;
+2. the scale of C_flash, the three reflectance numbers of the subject, and a gain for each flash frame (lamps droop);
+3. normals: robust least squares for b = albedo * n under the frames' light directions (Woodham 1980), with the
+   geometric normal as a prior in the directions that the lights do not span. The prior's weight is the ratio of the
+   two variances, the photometric one measured from the residual;
+4. albedo: robust least squares per channel;
+5. points that the flash did not reach are filled from their neighbours (`relight.infill`).
+
+Robust: frames in which gloss, a shadow, a wrong visibility or a moved pose spoils a point lose weight by a Cauchy
+function of their residual. Clipped pixels never had any.
+
+Units: radiance 1.0 = white clip. Only albedo * C is observable, so a scale has to be chosen: the brightest twentieth
+of the points that the flash saw has albedo `ALBEDO_95` (mean of the channels), and the flash is taken for white.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import torch
+
+from relight.cloud import CloudConfig, prepare_cloud
+from relight.errors import PlanError
+from relight.infill import infill
+from relight.observations import Observations, observe_points
+from relight.portrait import Portrait
+from relight.reflectance import GRAZING, Reflectance, fit_reflectance
+from relight.scene import Scene
+from relight.stages import Progress, no_progress
+
+ALBEDO_95 = 0.6
+"""Mean-channel albedo given to the 95th percentile of the points: that of fair skin, in the middle of the range."""
+
+_CHUNK = 1 << 16  # points at a time: [K, chunk, 3] arrays stay in tens of megabytes
+_SAMPLE = 20_000  # points from which global quantities are fitted
+_ROOM_RELATIVE = 0.06  # spread of a point's room radiance over the views that counts as noise, e.g. gloss
+_FLOOR = 0.004  # radiance of one 8-bit code in the shadows, and albedo that is as good as black
+_OUTSIDE_LIMIT = (
+    0.05  # share of the frames that may show a point off the subject: masks and poses err by a pixel
+)
+_ITERATIONS = 4
+
+
+@dataclass(frozen=True)
+class SolveConfig:
+    """Settings of the photometric solve.
+
+    Attributes:
+        cloud: How the cloud is prepared.
+        normal_sigma_rad: Standard error of the geometric normals, the weight of the prior.
+        fit_gloss: Whether the subject's gloss and retro-reflection are fitted; otherwise it is taken as Lambertian.
+        fit_gains: Whether the flash frames' gains are fitted; otherwise all flashes are taken as equal.
+        known: Information (sum of weighted squared cosines over the flash frames) that makes an albedo known: 0.25 is
+            one flash frame at 60 degrees.
+    """
+
+    cloud: CloudConfig = CloudConfig()
+    normal_sigma_rad: float = 0.06
+    fit_gloss: bool = True
+    fit_gains: bool = True
+    known: float = 0.25
+
+
+@dataclass(frozen=True, eq=False)
+class _Flash:
+    """The flash frames' part of the observations for some points.
+
+    Attributes:
+        response: [K, P, 3], q of the module's docstring.
+        weight: [K, P], 0 where nothing was observed.
+        to_light: [K, P, 3], unit.
+    """
+
+    response: torch.Tensor
+    weight: torch.Tensor
+    to_light: torch.Tensor
+
+    def cosine(self, normals: torch.Tensor) -> torch.Tensor:
+        """[K, P] between normals and light directions."""
+        return (normals * self.to_light).sum(dim=-1)
+
+
+def solve(scene: Scene, config: SolveConfig = SolveConfig(), progress: Progress = no_progress) -> Portrait:
+    """Solves a scene.
+
+    Args:
+        scene: With at least one flash and one no-flash frame.
+        config: See there.
+        progress: Told ("cloud" | "observe" | "solve", fraction).
+
+    Raises:
+        PlanError: There are no flash or no no-flash frames, or too few points, or the frames do not see the cloud.
+    """
+    flags = [view.flash for view in scene.views]
+    if not any(flags) or all(flags):
+        kind = "flash" if not any(flags) else "no-flash"
+        raise PlanError(f"The scene has no {kind} frames; the solve needs frames with and without the flash.")
+    progress("cloud", 0.0)
+    normals_given = None if scene.normals_world is None else scene.normals_world.cpu().numpy()
+    surface = prepare_cloud(
+        scene.points.cpu().numpy(), normals_given, [view.camera for view in scene.views], config.cloud
+    )
+    progress("cloud", 1.0)
+    observations = observe_points(scene, surface, progress)
+    progress("solve", 0.0)
+    points = torch.from_numpy(surface.points).to(scene.device)
+    prior = torch.from_numpy(surface.normals_world).to(scene.device)
+    # What masks carve away takes no part; it is dropped at the end, for a copy of the observations would be large.
+    on_subject = observations.outside <= _OUTSIDE_LIMIT
+    observations.cosine.mul_(on_subject)
+    if not bool((observations.cosine > 0).any()):
+        raise PlanError("No frame sees any point of the cloud; are poses and cloud in the same coordinates?")
+
+    room, room_information = _room_radiance(observations)
+    flash = _flash_part(observations, points, room, room_information)
+    scale, reflectance, gains = _global_quantities(flash, prior, config)
+    normals, sigma = torch.empty_like(prior), points.new_empty(len(points))
+    albedo, information, residual = torch.empty_like(prior), torch.empty_like(sigma), torch.empty_like(sigma)
+    relative = _relative_noise(flash, prior, scale, reflectance, gains)
+    prior_weight = (relative / config.normal_sigma_rad) ** 2
+    for part in _chunks(len(points)):
+        chunk = _normalised(flash, part, scale, gains)
+        normals[part] = _fit_normals(chunk, prior[part], reflectance, prior_weight, relative)
+        albedo[part], information[part], residual[part], sigma[part] = _fit_albedo(
+            chunk, normals[part], reflectance, relative
+        )
+        progress("solve", part.stop / len(points))
+    known = information > config.known
+    if not bool(known.any()):
+        raise PlanError(
+            "The flash frames do not light any point enough to solve for it; is the flash flag of the frames right, "
+            "and is the subject what the flash lights?"
+        )
+    albedo = infill(points, albedo, information, known=config.known, nearest=surface.spacing)
+    room = infill(points, room, room_information, known=0.3, nearest=surface.spacing)
+    gauge = ALBEDO_95 / float(torch.quantile(_sampled(albedo[known].mean(dim=1)), 0.95).clamp(min=1e-6))
+    albedo = (albedo * gauge).clamp(min=0.0)
+    c_room, shading = _split_room(room, albedo, information > config.known)
+    normal_sigma = _normal_sigma(information, relative, config.normal_sigma_rad)
+    share = information / config.known
+    portrait = Portrait(
+        points=points,
+        normals_world=normals,
+        albedo=albedo,
+        room_radiance=room.clamp(min=0.0),
+        shading=shading,
+        confidence=share / (1.0 + share),
+        albedo_sigma=(sigma * gauge).clamp(max=1.0),
+        normal_sigma_rad=normal_sigma,
+        residual=residual,
+        spacing=surface.spacing,
+        c_room=_three(c_room),
+        c_flash=(scale / gauge,) * 3,
+        flash_offset_cam_m=_three(torch.as_tensor(scene.flash_offset_cam_m)),
+        reflectance=Reflectance(reflectance.retro, reflectance.alpha, reflectance.f0 * gauge),
+        info={
+            "solver": "photometric",
+            "frames": len(scene.views),
+            "flash_frames": sum(flags),
+            "flash_gains": [round(float(gain), 4) for gain in gains],
+            "relative_noise": round(relative, 4),
+            "cloud_noise": surface.noise,
+            "known_share": round(float(known.float().mean()), 4),
+        },
+    )
+    return portrait if bool(on_subject.all()) else portrait.subset(on_subject)
+
+
+def _room_radiance(observations: Observations) -> tuple[torch.Tensor, torch.Tensor]:
+    """Robust mean over the no-flash frames [P, 3], and the sum of weights [P]; 0 where no frame sees the point."""
+    dark = ~observations.flash
+    rooms, informations = [], []
+    for part in _chunks(observations.cosine.shape[1]):
+        samples, weight = observations.radiance[dark, part], observations.cosine[dark, part]
+        robust = weight
+        for _ in range(_ITERATIONS):
+            total = robust.sum(dim=0).clamp(min=1e-6)
+            room = (robust[..., None] * samples).sum(dim=0) / total[:, None]
+            deviation = (samples - room).abs().mean(dim=-1) / (_ROOM_RELATIVE * room.mean(dim=-1) + _FLOOR)
+            robust = weight / (1.0 + (0.5 * deviation) ** 2)
+        rooms.append(room)
+        informations.append(weight.sum(dim=0))
+    return torch.cat(rooms), torch.cat(informations)
+
+
+def _flash_part(
+    observations: Observations, points: torch.Tensor, room: torch.Tensor, room_information: torch.Tensor
+) -> _Flash:
+    """Flash-added radiance times d^2, without the flash's scale, and where it comes from."""
+    lit = observations.flash
+    weight = (observations.cosine[lit] > 0).float() * (room_information > 0.5)
+    response = torch.empty_like(observations.radiance[lit])
+    to_light = torch.empty_like(response)
+    for k, position in enumerate(observations.flash_position_world[lit]):
+        towards = position - points
+        square = (towards * towards).sum(dim=1, keepdim=True)
+        to_light[k] = towards / square.sqrt().clamp(min=1e-12)
+        response[k] = (observations.radiance[lit.nonzero()[k, 0]] - room) * square * weight[k, :, None]
+    return _Flash(response, weight, to_light)
+
+
+def _global_quantities(
+    flash: _Flash, normals: torch.Tensor, config: SolveConfig
+) -> tuple[float, Reflectance, torch.Tensor]:
+    """Scale of C_flash, reflectance of the subject and gain of each flash frame [K], from a sample of the points."""
+    step = max(1, flash.weight.shape[1] // _SAMPLE)
+    sample = slice(None, None, step)
+    gains = flash.response.new_ones(len(flash.response))
+    matte = Reflectance()
+    cosine = flash.cosine(normals)[:, sample]
+    weight = flash.weight[:, sample]
+    response = flash.response[:, sample].mean(dim=-1)
+    albedo, information, _, _ = _fit_albedo(
+        _Flash(response[..., None], weight, flash.to_light[:, sample]), normals[sample], matte, None
+    )
+    seen = information > config.known
+    if not bool(seen.any()):
+        return 1.0, matte, gains
+    scale = float(torch.quantile(albedo[seen, 0], 0.95).clamp(min=1e-9)) / ALBEDO_95
+    reflectance = matte
+    for _ in range(2):
+        scaled = response / scale / gains[:, None]
+        if config.fit_gloss:
+            reflectance = fit_reflectance(cosine, scaled, weight)
+        if config.fit_gains:
+            gains = gains * _frame_gains(cosine, scaled, weight, reflectance)
+    return scale, reflectance, gains
+
+
+def _frame_gains(
+    cosine: torch.Tensor, response: torch.Tensor, weight: torch.Tensor, reflectance: Reflectance
+) -> torch.Tensor:
+    """Gain of each frame [K] against the points' albedos from all frames: a median of ratios; 1 on the whole."""
+    diffuse, gloss = reflectance.diffuse(cosine), reflectance.gloss(cosine)
+    weight = weight * (cosine > 0.5)
+    norm = (weight * diffuse**2).sum(dim=0)
+    albedo = (weight * diffuse * (response - gloss)).sum(dim=0) / norm.clamp(min=1e-6)
+    gains = response.new_ones(len(response))
+    for k in range(len(response)):
+        used = (weight[k] > 0) & (albedo > 10 * _FLOOR) & ((weight > 0).sum(dim=0) >= 3)
+        if int(used.sum()) >= 100:  # the median of fewer is no better known than lamps are equal
+            model = albedo[used] * diffuse[k, used] + gloss[k, used]
+            gains[k] = (response[k, used] / model).median()
+    return (gains / gains.median()).clamp(0.5, 2.0)
+
+
+def _normalised(flash: _Flash, part: slice, scale: float, gains: torch.Tensor) -> _Flash:
+    """The observations of some points in units of the albedo."""
+    factor = (1.0 / (scale * gains))[:, None, None]
+    return _Flash(flash.response[:, part] * factor, flash.weight[:, part], flash.to_light[:, part])
+
+
+def _relative_noise(
+    flash: _Flash, normals: torch.Tensor, scale: float, reflectance: Reflectance, gains: torch.Tensor
+) -> float:
+    """Robust standard deviation of a flash observation relative to its albedo, with the geometric normals."""
+    step = max(1, flash.weight.shape[1] // _SAMPLE)
+    sample = slice(None, None, step)
+    chunk = _normalised(flash, sample, scale, gains)
+    albedo, information, residual, _ = _fit_albedo(chunk, normals[sample], reflectance, None)
+    used = (information > 0.5) & (albedo.mean(dim=1) > 10 * _FLOOR)
+    if not bool(used.any()):
+        return 0.06
+    return float(residual[used].median().clamp(0.01, 0.5))
+
+
+def _fit_normals(
+    flash: _Flash, prior: torch.Tensor, reflectance: Reflectance, prior_weight: float, relative: float
+) -> torch.Tensor:
+    """Unit normals [P, 3], the prior where nothing was observed or the result strays over 45 degrees."""
+    response = flash.response.mean(dim=-1)
+    normals = prior
+    tangential = torch.eye(3).to(prior) - prior[:, :, None] * prior[:, None, :]
+    for _ in range(_ITERATIONS - 1):
+        cosine = flash.cosine(normals)
+        diffuse = reflectance.diffuse(cosine)
+        # diffuse(c) = gain c: with the gain of the last normal the model is linear in b = albedo n.
+        gain = diffuse / cosine.clamp(min=1e-3)
+        matte = response - reflectance.gloss(cosine)
+        weight = flash.weight * (cosine > GRAZING) * cosine
+        albedo = (weight * diffuse * matte).sum(dim=0) / (weight * diffuse**2).sum(dim=0).clamp(min=1e-6)
+        deviation = (matte - albedo * diffuse) / (relative * albedo.abs() + _FLOOR)
+        weight = weight / (1.0 + (0.5 * deviation) ** 2)
+        weighted = (weight * gain**2)[..., None] * flash.to_light
+        left = torch.einsum("kpi,kpj->pij", weighted, flash.to_light) + prior_weight * tangential
+        left = left + 1e-4 * torch.eye(3).to(left)
+        right = ((weight * gain * matte)[..., None] * flash.to_light).sum(dim=0) + 1e-4 * albedo[
+            :, None
+        ] * prior
+        b = torch.linalg.solve(left.double(), right.double()).to(prior)
+        fitted = b / torch.linalg.vector_norm(b, dim=1, keepdim=True).clamp(min=1e-12)
+        sane = ((fitted * prior).sum(dim=1) > 0.7) & (albedo > _FLOOR)
+        normals = torch.where(sane[:, None], fitted, prior)
+    return normals
+
+
+def _fit_albedo(
+    flash: _Flash, normals: torch.Tensor, reflectance: Reflectance, relative: float | None
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Albedo [P, C], information [P], relative residual [P] and standard error [P]; without `relative` not robust."""
+    cosine = flash.cosine(normals)
+    diffuse = reflectance.diffuse(cosine)
+    matte = flash.response - reflectance.gloss(cosine)[..., None]
+    weight = flash.weight * (cosine > GRAZING) * cosine.clamp(min=0.0)
+    robust = weight
+    for iteration in range(_ITERATIONS if relative is not None else 1):
+        information = (robust * diffuse**2).sum(dim=0)
+        albedo = ((robust * diffuse)[..., None] * matte).sum(dim=0) / information.clamp(min=1e-6)[:, None]
+        deviation = (matte - albedo * diffuse[..., None]).mean(dim=-1)
+        if relative is not None and iteration + 1 < _ITERATIONS:
+            spread = relative * albedo.mean(dim=-1).abs() + _FLOOR
+            robust = weight / (1.0 + (0.5 * deviation / spread) ** 2)
+    frames = (weight > 0).sum(dim=0)
+    variance = (weight * deviation**2).sum(dim=0) / weight.sum(dim=0).clamp(min=1e-6)
+    variance = variance * frames / (frames - 1).clamp(min=1)
+    residual = variance.sqrt() / (albedo.mean(dim=-1).abs() + _FLOOR)
+    return albedo, information, residual, (variance / information.clamp(min=1e-6)).sqrt().clamp(max=1.0)
+
+
+def _split_room(
+    room: torch.Tensor, albedo: torch.Tensor, known: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """C_room [3] and shading [P] 0..1 with room = albedo C_room s as nearly as a grey s can (eq. 4, first term).
+
+    The colour is the median of room / albedo where the albedo is known; the scale makes the brightest hundredth 1.
+    """
+    ratio = room / albedo.clamp(min=_FLOOR)
+    used = known & (albedo.mean(dim=1) > 10 * _FLOOR)
+    if not bool(used.any()) or float(room.max()) <= 0:
+        return room.new_zeros(3), room.new_zeros(len(room))
+    colour = ratio[used].median(dim=0).values
+    if float(colour.max()) <= 0:
+        return room.new_zeros(3), room.new_zeros(len(room))
+    weight = albedo * colour
+    shading = (room * weight).sum(dim=1) / (weight * weight).sum(dim=1).clamp(min=1e-12)
+    top = torch.quantile(_sampled(shading[used]), 0.99).clamp(min=1e-6)
+    return colour * top, (shading / top).clamp(0.0, 1.0)
+
+
+def _normal_sigma(information: torch.Tensor, relative: float, prior_sigma: float) -> torch.Tensor:
+    """Standard error of the normal, radians: prior and flash frames together."""
+    # A cosine c changes by sin per radian: tangential information is that of the frames times about tan^2 = 0.5.
+    photometric = 0.5 * information / relative**2
+    return (1.0 / (1.0 / prior_sigma**2 + photometric)).sqrt()
+
+
+def _chunks(count: int) -> Iterator[slice]:
+    for start in range(0, count, _CHUNK):
+        yield slice(start, min(start + _CHUNK, count))
+
+
+def _sampled(values: torch.Tensor) -> torch.Tensor:
+    """At most about a million values: torch.quantile takes no more than 16 million, and needs no more than these."""
+    return values[:: max(1, len(values) // 1_000_000)]
+
+
+def _three(values: torch.Tensor) -> tuple[float, float, float]:
+    x, y, z = (float(value) for value in values)
+    return x, y, z

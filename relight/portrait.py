@@ -1,0 +1,154 @@
+"""A fitted portrait: points of the surface with what is known of each, and the lights it was captured in.
+
+    portrait.safetensors     tensors, one row a point
+    portrait.json            version, colours, reflectance, spacing, and where it came from
+
+Nothing that is loaded can run code.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save
+
+from capture.atomic import atomic_write
+from relight.errors import PortraitError
+from relight.reflectance import Reflectance
+
+VERSION = 1
+
+TENSORS_FILE = "portrait.safetensors"
+FIELDS_FILE = "portrait.json"
+
+_TENSORS = {
+    "points": 3,
+    "normals_world": 3,
+    "albedo": 3,
+    "room_radiance": 3,
+    "shading": 0,
+    "confidence": 0,
+    "albedo_sigma": 0,
+    "normal_sigma_rad": 0,
+    "residual": 0,
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Portrait:
+    """Points of the surface; P of them, all tensors float32 and finite.
+
+    Attributes:
+        points: [P, 3] world.
+        normals_world: [P, 3] unit.
+        albedo: [P, 3] linear. Its scale is a convention (see `relight.photometric`): only albedo * C is observable.
+        room_radiance: [P, 3] linear radiance under the room's light, colour of the room's light included. The paper's
+            A * C_room * s is its grey approximation.
+        shading: [P] room shading s, 0..1.
+        confidence: [P] 0..1, how well the flash observed the point; 0 = filled in from neighbours.
+        albedo_sigma: [P] standard error of the albedo (mean of channels), infinite nowhere: 1 where unknown.
+        normal_sigma_rad: [P] standard error of the normal, radians.
+        residual: [P] root mean square of what the fit leaves in the flash frames, relative to the albedo.
+        spacing: Typical distance between points, world units.
+        c_room: [3] colour of the room's light: radiance of a white surface at s = 1.
+        c_flash: [3] colour of the flash: radiance of a white surface that faces it from a distance of 1.
+        flash_offset_cam_m: [3] lens to flash in camera axes.
+        reflectance: Of the whole subject.
+        info: Free-form facts: software, source, settings, warnings.
+    """
+
+    points: torch.Tensor
+    normals_world: torch.Tensor
+    albedo: torch.Tensor
+    room_radiance: torch.Tensor
+    shading: torch.Tensor
+    confidence: torch.Tensor
+    albedo_sigma: torch.Tensor
+    normal_sigma_rad: torch.Tensor
+    residual: torch.Tensor
+    spacing: float
+    c_room: tuple[float, float, float]
+    c_flash: tuple[float, float, float]
+    flash_offset_cam_m: tuple[float, float, float]
+    reflectance: Reflectance
+    info: Mapping[str, Any]
+
+    def to(self, device: torch.device | str) -> Portrait:
+        """The portrait with its tensors on a device."""
+        return replace(self, **{name: getattr(self, name).to(device) for name in _TENSORS})
+
+    def subset(self, keep: torch.Tensor) -> Portrait:
+        """Some of the points: [P] bool, or their indices."""
+        return replace(self, **{name: getattr(self, name)[keep] for name in _TENSORS})
+
+    def save(self, folder: Path) -> None:
+        """Writes the two files; each is there whole or not at all."""
+        folder.mkdir(parents=True, exist_ok=True)
+        tensors = {name: getattr(self, name).detach().cpu().float().contiguous() for name in _TENSORS}
+        content = {"schema": "relight-portrait", "version": VERSION, "points": len(self.points)}
+        for field in fields(self):
+            if field.name not in _TENSORS and field.name != "reflectance":
+                content[field.name] = getattr(self, field.name)
+        content["reflectance"] = asdict(self.reflectance)
+        atomic_write(folder / TENSORS_FILE, save(tensors))
+        atomic_write(folder / FIELDS_FILE, (json.dumps(content, indent=2, allow_nan=False) + "\n").encode())
+
+
+def load_portrait(folder: Path, device: torch.device | str = "cpu") -> Portrait:
+    """Reads a portrait.
+
+    Raises:
+        PortraitError: It is not there, not whole, of a newer version, or malformed.
+    """
+    folder = Path(folder)
+    for file in (FIELDS_FILE, TENSORS_FILE):
+        if not (folder / file).is_file():
+            raise PortraitError(
+                f"There is no portrait in {folder} ({file} is missing); run `relight fit` first."
+            )
+    try:
+        content = json.loads((folder / FIELDS_FILE).read_bytes())
+        if content["schema"] != "relight-portrait":
+            raise ValueError("it is no portrait")
+        version = content["version"]
+    except (ValueError, KeyError, TypeError) as error:
+        raise PortraitError(
+            f"{folder / FIELDS_FILE} cannot be read ({error}); fit the portrait again."
+        ) from error
+    if version != VERSION:
+        raise PortraitError(
+            f"{folder / FIELDS_FILE} has version {version}, this program reads version {VERSION}; "
+            "update the program or fit the portrait again."
+        )
+    try:
+        tensors = load_file(folder / TENSORS_FILE, device=str(device))
+        count = int(content["points"])
+        for name, width in _TENSORS.items():
+            shape = (count, width) if width else (count,)
+            if tuple(tensors[name].shape) != shape or not torch.isfinite(tensors[name]).all():
+                raise ValueError(f"{name} is not a finite array of shape {list(shape)}")
+        return Portrait(
+            **{name: tensors[name] for name in _TENSORS},
+            spacing=float(content["spacing"]),
+            c_room=_vector(content["c_room"]),
+            c_flash=_vector(content["c_flash"]),
+            flash_offset_cam_m=_vector(content["flash_offset_cam_m"]),
+            reflectance=Reflectance(**content["reflectance"]),
+            info=dict(content["info"]),
+        )
+    except (SafetensorError, OSError, ValueError, KeyError, TypeError) as error:
+        raise PortraitError(f"The portrait in {folder} is damaged ({error}); fit it again.") from error
+
+
+def _vector(values: Any) -> tuple[float, float, float]:
+    x, y, z = (float(value) for value in values)
+    if not np.isfinite([x, y, z]).all():
+        raise ValueError(f"{values} is not a finite vector")
+    return x, y, z

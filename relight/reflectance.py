@@ -1,0 +1,140 @@
+"""How the subject's surface reflects light beyond Lambert, with three numbers.
+
+With the lamp next to the lens, light and view direction are one and reflectance depends on a single angle: c, the
+cosine between it and the normal. Two effects bend the curve away from Lambert's c on skin and most else: the
+retro-reflection of rough surfaces towards grazing angles (Burley 2012, "Physically based shading at Disney",
+section 5.3) and gloss at normal incidence (GGX, Walter et al. 2007). Per point, albedo and normal would have to
+explain both; as three numbers of the whole subject they can be fitted from all points and frames at once:
+
+    L d^2 / C = albedo c (1 + retro (1 - c)^5)^2  +  f0 gloss(c)
+    gloss(c) = alpha^2 c / (4 (c (1 - k) + k)^2 (c^2 (alpha^2 - 1) + 1)^2),    k = alpha / 2 (Schlick's G)
+
+L is the radiance that a light of colour C adds from a distance d, in units in which a white Lambertian surface facing
+it has L d^2 / C = 1: the pi of irradiance and the 1/pi of the BRDF have cancelled. `Reflectance.response` is the same
+model for any directions of light and view.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+GRAZING = 0.2
+"""Cosine below which a flash observation is not used: there the model, the pose and the depth err most."""
+
+_RETROS = (0.0, 0.25, 0.5, 0.75)
+_ALPHAS = (0.08, 0.12, 0.18, 0.25, 0.35, 0.5)
+_SCALE = 0.02  # residual that counts as noise, for albedos of the order of one half
+_ITERATIONS = 5
+
+
+@dataclass(frozen=True)
+class Reflectance:
+    """Of the whole subject.
+
+    Attributes:
+        retro: Strength of retro-reflection at grazing angles; 0 = Lambert.
+        alpha: GGX width, roughness squared.
+        f0: Reflectance of the gloss at normal incidence, in units of the albedo's scale; 0 = matte.
+    """
+
+    retro: float = 0.0
+    alpha: float = 0.25
+    f0: float = 0.0
+
+    def diffuse(self, cosine: torch.Tensor) -> torch.Tensor:
+        """What multiplies the albedo, c (1 + retro (1 - c)^5)^2; 0 for c <= 0."""
+        c = cosine.clamp(0.0, 1.0)
+        return c * (1.0 + self.retro * (1.0 - c) ** 5) ** 2
+
+    def gloss(self, cosine: torch.Tensor) -> torch.Tensor:
+        """What is added, f0 * gloss(c); 0 for c <= 0."""
+        return self.f0 * gloss_lobe(cosine, self.alpha)
+
+    def response(
+        self, albedo: torch.Tensor, normals: torch.Tensor, to_light: torch.Tensor, to_view: torch.Tensor
+    ) -> torch.Tensor:
+        """Radiance under a light of unit colour at unit distance, for any directions.
+
+        For to_view = to_light it is `albedo * diffuse(c) + gloss(c)`. Away from there Burley's retro-reflection fades
+        with the angle between light and view, and gloss is GGX with Schlick's Fresnel term.
+
+        Args:
+            albedo: [..., 3].
+            normals: [..., 3], unit, or 0 where no surface is known: there the response is 0.
+            to_light: [..., 3], unit.
+            to_view: [..., 3], unit.
+
+        Returns:
+            [..., 3], 0 where the light is behind the surface.
+        """
+        light = (normals * to_light).sum(dim=-1, keepdim=True).clamp(0.0, 1.0)
+        view = (normals * to_view).sum(dim=-1, keepdim=True).clamp(0.0, 1.0)
+        half = to_light + to_view
+        # Opposite directions have no half vector; a vanishing one is none of the surface's either.
+        half = half / torch.linalg.vector_norm(half, dim=-1, keepdim=True).clamp(min=1e-6)
+        deviation = (half * to_light).sum(dim=-1, keepdim=True).clamp(0.0, 1.0)
+        diffuse = light
+        if self.retro > 0:
+            grazing = (self.retro + 0.5) * deviation**2 - 0.5
+            diffuse = light * (1.0 + grazing * (1.0 - light) ** 5) * (1.0 + grazing * (1.0 - view) ** 5)
+        result = albedo * diffuse
+        if self.f0 > 0:
+            k, square = self.alpha / 2.0, self.alpha**2
+            fresnel = self.f0 + (1.0 - self.f0) * (1.0 - deviation) ** 5
+            normal = (normals * half).sum(dim=-1, keepdim=True).clamp(0.0, 1.0)
+            masking = 4.0 * (light * (1.0 - k) + k) * (view * (1.0 - k) + k)
+            result = result + fresnel * square * light / (masking * (normal**2 * (square - 1.0) + 1.0) ** 2)
+        return result
+
+
+def gloss_lobe(cosine: torch.Tensor, alpha: float) -> torch.Tensor:
+    """Gloss seen along the light's direction, for f0 = 1; 0 for c <= 0."""
+    c = cosine.clamp(0.0, 1.0)
+    k, square = alpha / 2.0, alpha * alpha
+    return square * c / (4.0 * (c * (1.0 - k) + k) ** 2 * (c * c * (square - 1.0) + 1.0) ** 2)
+
+
+def fit_reflectance(cosine: torch.Tensor, response: torch.Tensor, weight: torch.Tensor) -> Reflectance:
+    """Fits the three numbers with the albedo of every point left free (variable projection, robust).
+
+    Args:
+        cosine: [K, P] of each flash frame and point.
+        response: [K, P], flash-added radiance * d^2, scaled so that albedos are of the order of one half.
+        weight: [K, P], 0 where there is no observation.
+
+    Returns:
+        The best of a grid over `retro` and `alpha`, `f0` by least squares; Lambert if nothing was observed.
+    """
+    weight = weight * (cosine > GRAZING) * cosine.clamp(min=0.0)
+    weight = weight * ((weight > 0).sum(dim=0) >= 3)  # with one or two frames an albedo explains everything
+    total = float(weight.sum(dtype=torch.float64))
+    if total <= 0:
+        return Reflectance()
+    best, lowest = Reflectance(), float("inf")
+    for retro in _RETROS:
+        diffuse = Reflectance(retro).diffuse(cosine)
+        for alpha in _ALPHAS:
+            f0, loss = _fit_f0(diffuse, gloss_lobe(cosine, alpha), response, weight)
+            if loss < lowest:
+                best, lowest = Reflectance(retro, alpha, f0), loss
+    return best
+
+
+def _fit_f0(
+    diffuse: torch.Tensor, lobe: torch.Tensor, response: torch.Tensor, weight: torch.Tensor
+) -> tuple[float, float]:
+    """f0 >= 0 and the robust loss, with each point's albedo projected out of the problem."""
+    robust = weight
+    for _ in range(_ITERATIONS):
+        weighted = robust * diffuse
+        norm = (weighted * diffuse).sum(dim=0).clamp(min=1e-9)
+        response_left = response - diffuse * ((weighted * response).sum(dim=0) / norm)
+        lobe_left = lobe - diffuse * ((weighted * lobe).sum(dim=0) / norm)
+        along = float((robust * response_left * lobe_left).sum(dtype=torch.float64))
+        f0 = max(0.0, along / max(float((robust * lobe_left**2).sum(dtype=torch.float64)), 1e-12))
+        residual = (response_left - f0 * lobe_left) / _SCALE
+        robust = weight / (1.0 + residual**2)
+    loss = (weight * torch.log1p(residual**2)).sum(dtype=torch.float64) / weight.sum(dtype=torch.float64)
+    return f0, float(loss)

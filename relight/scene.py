@@ -1,0 +1,179 @@
+"""What a fit reads from a session: undistorted cameras, the cloud, and frames in linear radiance on demand.
+
+Frames are read one at a time and only when asked for, so memory does not grow with their number.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from calib.calibration import load_calibration
+from capture.cameras import Camera
+from capture.frame_record import FrameRecord
+from capture.ply import read_ply
+from capture.session import Session
+from relight.errors import PlanError
+from relight.stages import Progress, no_progress
+
+CLIPPED_RADIANCE = 0.95
+"""Integer pixels at or above this radiance in any channel are taken for clipped (sRGB code 249 of 255)."""
+
+_FLOAT_SUFFIXES = (".exr", ".hdr")  # these keep what is above the white clip
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A frame of the scene.
+
+    Attributes:
+        index: The frame's number in the session.
+        camera: Without distortion: frames are undistorted when they are read.
+        flash: Flag F, 1 or 0.
+    """
+
+    index: int
+    camera: Camera
+    flash: int
+
+
+@dataclass(frozen=True, eq=False)
+class Observation:
+    """One frame's pixels.
+
+    Attributes:
+        radiance: [H, W, 3] float32, linear, 1.0 = white clip.
+        valid: [H, W] float32, 1 where the pixel can be trusted, 0 where it is clipped, not finite or outside the lens.
+        mask: [H, W] float32 0..1 coverage of the subject, None = not given.
+    """
+
+    radiance: torch.Tensor
+    valid: torch.Tensor
+    mask: torch.Tensor | None
+
+
+class Scene:
+    """A session as the fit sees it.
+
+    Attributes:
+        points: [P, 3] float32, world.
+        normals_world: [P, 3] unit as the cloud brings them, or None.
+        views: The frames to fit.
+        flash_offset_cam_m: [3] lens to flash in camera axes; zero when unknown (the paper's co-located flash).
+        device: Where the solve runs.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        points: torch.Tensor,
+        normals_world: torch.Tensor | None,
+        views: tuple[View, ...],
+        flash_offset_cam_m: NDArray[np.float64],
+        device: torch.device,
+        records: dict[int, FrameRecord],
+        distorted: dict[int, Camera],
+    ) -> None:
+        """For `load_scene` only."""
+        self.points = points
+        self.normals_world = normals_world
+        self.views = views
+        self.flash_offset_cam_m = flash_offset_cam_m
+        self.device = device
+        self._session = session
+        self._records = records
+        self._distorted = distorted
+
+    def observe(self, view: View) -> Observation:
+        """Reads, linearises and undistorts a frame and its mask."""
+        record = self._records[view.index]
+        radiance = self._session.load_radiance(record)
+        finite = np.isfinite(radiance).all(axis=-1)
+        if not finite.all():
+            radiance = np.where(finite[..., None], radiance, np.float32(0.0))
+        limit = np.inf if str(record.file).endswith(_FLOAT_SUFFIXES) else CLIPPED_RADIANCE
+        valid = (finite & (radiance.max(axis=-1) < limit)).astype(np.float32)
+        coverage = self._session.load_mask(record)
+        mask = None if coverage is None else coverage.astype(np.float32) / np.float32(255.0)
+        if view.index in self._distorted:
+            grid = _undistortion_grid(self._distorted[view.index], view.camera)
+            radiance, valid = (cv2.remap(image, *grid, cv2.INTER_LINEAR) for image in (radiance, valid))
+            mask = None if mask is None else cv2.remap(mask, *grid, cv2.INTER_LINEAR)
+        return Observation(
+            torch.from_numpy(radiance).to(self.device),
+            torch.from_numpy(valid).to(self.device),
+            None if mask is None else torch.from_numpy(mask).to(self.device),
+        )
+
+
+def load_scene(
+    session: Session,
+    *,
+    frames: Sequence[int],
+    device: torch.device | str = "cpu",
+    progress: Progress = no_progress,
+) -> Scene:
+    """Opens what a fit needs.
+
+    Args:
+        session: With poses and a cloud in its scene folder.
+        frames: Indices to use; each has a pose and a flash flag.
+        device: Where the solve shall run.
+        progress: Told ("read", fraction).
+
+    Raises:
+        PlanError: A frame has no pose or no flag, or the cloud is empty.
+    """
+    device = torch.device(device)
+    cameras = session.load_scene_cameras()
+    records = {record.index: record for record in session.frames}
+    views, distorted = [], {}
+    for index in frames:
+        camera = cameras.get(index)
+        flash = records[index].flash if index in records else None
+        if camera is None or flash is None:
+            missing = "pose" if camera is None else "flash flag"
+            raise PlanError(f"Frame {index} of {session.path} has no {missing}; leave it out of the fit.")
+        if camera.distortion.any():
+            distorted[index] = camera
+        views.append(View(index, replace(camera, distortion=np.zeros(0), flash=flash), flash))
+    progress("read", 0.5)
+    cloud = read_ply(session.points_path)
+    points = torch.from_numpy(np.ascontiguousarray(cloud.points, dtype=np.float32))
+    normals = None
+    if cloud.normals is not None:
+        normals = torch.from_numpy(np.ascontiguousarray(cloud.normals, dtype=np.float32))
+    if not len(points):
+        raise PlanError(f"The cloud {session.points_path} has no points; a fit needs one.")
+    offset = load_calibration(session.calibration_path).value("flash_offset_cam_m")
+    progress("read", 1.0)
+    return Scene(
+        session,
+        points,
+        normals,
+        tuple(views),
+        np.zeros(3) if offset is None else offset,
+        device,
+        {view.index: records[view.index] for view in views},
+        distorted,
+    )
+
+
+def _undistortion_grid(
+    distorted: Camera, straight: Camera
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """For cv2.remap: where each pixel of the straight picture lies in the distorted one, integer centres."""
+    to_integer_centres = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1]])
+    return cv2.initUndistortRectifyMap(
+        to_integer_centres @ distorted.K,
+        distorted.distortion,
+        np.eye(3),
+        to_integer_centres @ straight.K,
+        (straight.width, straight.height),
+        cv2.CV_32FC1,
+    )

@@ -1,0 +1,213 @@
+"""Shadows that the subject casts on itself under a new light: the paper's second limitation removed.
+
+A depth map of the portrait's points from the light, and the question whether a pixel lies behind it (Williams 1978,
+"Casting curved shadows on curved surfaces"). Cells are as wide as a few points, cells without a point take the nearest
+of their neighbours, and the tolerance grows with the slant of the surface, so that no light leaks between points and no
+surface shades itself; the answer is interpolated between four cells (Reeves et al. 1987).
+
+For a panorama, which is many distant lights, the question is answered once for every point of the portrait and looked
+up in every view.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+
+from relight.maps import Maps
+from relight.portrait import Portrait
+
+_CELL = 1.5  # of a depth map, in spacings of the points
+_CELL_MANY = 3.0  # where there are many lights, each counts little
+_BIAS = 2.4  # in spacings
+_SLANT = 2.0  # cells
+_STEEPEST = (
+    20.0  # tangent: surfaces that the light grazes at more than 87 degrees are dark by their cosine anyway
+)
+_LARGEST_SIDE = 4096  # cells
+
+
+class ShadowCaster:
+    """Depth maps of one portrait, made when a light is first asked for and kept for all views."""
+
+    def __init__(self, portrait: Portrait) -> None:
+        """A caster for a portrait."""
+        self.portrait = portrait
+        self._maps: dict[tuple[str, tuple[float, ...]], _DepthMap] = {}
+        self._seen: dict[bytes, torch.Tensor] = {}
+
+    def of_view(self, maps: Maps) -> ViewVisibility:
+        """The visibility of lights from the pixels of a view."""
+        return ViewVisibility(self, maps)
+
+    def point(self, position: torch.Tensor) -> _DepthMap:
+        """Depth map from a point light at [3]."""
+        return self._cached("point", position, lambda: _from_point(self.portrait, position))
+
+    def directional(self, to_light: torch.Tensor) -> _DepthMap:
+        """Depth map from a distant light in a direction [3]."""
+        return self._cached("distant", to_light, lambda: _from_afar(self.portrait, to_light, _CELL))
+
+    def points_seen_from(self, directions: torch.Tensor) -> torch.Tensor:
+        """Which of the points [P] each of the distant lights [K, 3] reaches: [K, P] bool."""
+        key = directions.detach().cpu().numpy().tobytes()
+        if key not in self._seen:
+            points, normals = self.portrait.points, self.portrait.normals_world
+            rows = [
+                (_from_afar(self.portrait, to_light, _CELL_MANY).visible(points, normals, soft=False) > 0.5)
+                for to_light in directions.to(points)
+            ]
+            self._seen[key] = (
+                torch.stack(rows) if rows else points.new_zeros((0, len(points)), dtype=torch.bool)
+            )
+        return self._seen[key]
+
+    def _cached(self, kind: str, vector: torch.Tensor, make) -> _DepthMap:  # type: ignore[no-untyped-def]
+        key = (kind, tuple(float(value) for value in vector))
+        if key not in self._maps:
+            self._maps[key] = make()
+        return self._maps[key]
+
+
+class ViewVisibility:
+    """How much of a light each pixel of a view sees (the protocol `relight.surface.Visibility`)."""
+
+    def __init__(self, caster: ShadowCaster, maps: Maps) -> None:
+        """For `ShadowCaster.of_view`."""
+        self._caster = caster
+        self._maps = maps
+
+    def point(self, position_world: torch.Tensor) -> torch.Tensor:
+        """[H, W] 0..1 for a point light at [3]."""
+        return self._of_pixels(self._caster.point(position_world))
+
+    def directional(self, to_light: torch.Tensor) -> torch.Tensor:
+        """[H, W] 0..1 for a distant light, unit direction [3]."""
+        return self._of_pixels(self._caster.directional(to_light))
+
+    def environment(self, directions: torch.Tensor) -> torch.Tensor:
+        """[K, H, W] 0 or 1 for distant lights [K, 3]; 1 off the subject."""
+        seen = self._caster.points_seen_from(directions)
+        ids = self._maps.point_ids
+        on = ids >= 0
+        visible = torch.ones((len(directions), *ids.shape), dtype=torch.bool, device=ids.device)
+        visible[:, on] = seen[:, ids[on]]
+        return visible
+
+    def _of_pixels(self, depth_map: _DepthMap) -> torch.Tensor:
+        on = self._maps.mask > 0
+        visible = torch.ones_like(self._maps.mask)
+        visible[on] = depth_map.visible(self._maps.points_world[on], self._maps.normals_world[on])
+        return visible
+
+
+@dataclass(frozen=True, eq=False)
+class _DepthMap:
+    """Nearest depth from a light on a grid.
+
+    Attributes:
+        axes: [3, 3], rows u, v, w; w points from the light (or along its rays) into the scene.
+        position: [3] of a point light; None for a distant one.
+        low: [2], grid coordinates of the map's corner.
+        cell: Width of a cell: world units for a distant light, radians for a point.
+        depth: [rows, columns], distance from the light or along its rays; inf where there is nothing.
+        cell_size: Of a cell at the subject, world units.
+        bias: World units.
+    """
+
+    axes: torch.Tensor
+    position: torch.Tensor | None
+    low: torch.Tensor
+    cell: float
+    depth: torch.Tensor
+    cell_size: float
+    bias: float
+
+    def visible(self, points: torch.Tensor, normals: torch.Tensor, soft: bool = True) -> torch.Tensor:
+        """[P] 0..1 for points [P, 3] with unit normals [P, 3]; `soft` interpolates between four cells."""
+        grid, depth, towards = _coordinates(points, self.axes, self.position)
+        cosine = (normals * towards).sum(dim=1)
+        slope = (1.0 - cosine**2).clamp(min=0.0).sqrt() / cosine.clamp(min=1.0 / _STEEPEST)
+        limit = depth - self.bias - _SLANT * self.cell_size * slope.clamp(max=_STEEPEST)
+        at = (grid - self.low) / self.cell
+        rows, columns = self.depth.shape
+        flat = self.depth.flatten()
+
+        def lit(column: torch.Tensor, row: torch.Tensor) -> torch.Tensor:
+            place = row.clamp(0, rows - 1) * columns + column.clamp(0, columns - 1)
+            return (limit <= flat[place]).to(points)
+
+        if not soft:
+            whole = at.floor().long()
+            return lit(whole[:, 0], whole[:, 1])
+        corner = (at - 0.5).floor()
+        x, y = (at - 0.5 - corner).unbind(1)
+        column, row = corner.long().unbind(1)
+        upper = (1 - x) * lit(column, row) + x * lit(column + 1, row)
+        lower = (1 - x) * lit(column, row + 1) + x * lit(column + 1, row + 1)
+        return (1 - y) * upper + y * lower
+
+
+def _from_point(portrait: Portrait, position: torch.Tensor) -> _DepthMap:
+    position = position.to(portrait.points)
+    centre = portrait.points.mean(dim=0)
+    axis = centre - position
+    distance = float(torch.linalg.vector_norm(portrait.points - position, dim=1).median())
+    if float(torch.linalg.vector_norm(axis)) < 1e-9:
+        axis = axis.new_tensor([0.0, 0.0, 1.0])
+    cell = _CELL * portrait.spacing / max(distance, portrait.spacing)
+    return _build(portrait, _frame(axis), position, cell, _CELL * portrait.spacing)
+
+
+def _from_afar(portrait: Portrait, to_light: torch.Tensor, cell: float) -> _DepthMap:
+    size = cell * portrait.spacing
+    return _build(portrait, _frame(-to_light.to(portrait.points)), None, size, size)
+
+
+def _build(
+    portrait: Portrait, axes: torch.Tensor, position: torch.Tensor | None, cell: float, cell_size: float
+) -> _DepthMap:
+    grid, depth, _ = _coordinates(portrait.points, axes, position)
+    low, high = grid.min(dim=0).values, grid.max(dim=0).values
+    cell = max(cell, float((high - low).max()) / _LARGEST_SIDE)
+    low = low - 1.5 * cell
+    columns, rows = (((high - low) / cell).long() + 2).tolist()
+    place = ((grid - low) / cell).long()
+    nearest = depth.new_full((rows * columns,), torch.inf)
+    nearest.scatter_reduce_(0, place[:, 1] * columns + place[:, 0], depth, "amin")
+    nearest = nearest.view(1, 1, rows, columns)
+    around = -torch.nn.functional.max_pool2d(-nearest, 3, 1, 1)
+    nearest = torch.where(torch.isinf(nearest), around, nearest)[0, 0]
+    return _DepthMap(axes, position, low, cell, nearest, cell_size, _BIAS * portrait.spacing)
+
+
+def _coordinates(
+    points: torch.Tensor, axes: torch.Tensor, position: torch.Tensor | None
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Grid coordinates [P, 2], depth [P] and unit directions to the light [P, 3] or [1, 3].
+
+    The grid of a distant light is the plane across its rays; that of a point light is azimuthal equidistant about the
+    axis, in radians, which has no edge at any angle short of straight behind the light.
+    """
+    if position is None:
+        local = points @ axes.T
+        return local[:, :2], local[:, 2], -axes[2:3]
+    local = (points - position) @ axes.T
+    across = torch.linalg.vector_norm(local[:, :2], dim=1)
+    distance = torch.linalg.vector_norm(local, dim=1)
+    angle = torch.atan2(across, local[:, 2])
+    grid = local[:, :2] * (angle / across.clamp(min=1e-12))[:, None]
+    return grid, distance, (position - points) / distance.clamp(min=1e-12)[:, None]
+
+
+def _frame(axis: torch.Tensor) -> torch.Tensor:
+    """[3, 3] right-handed orthonormal rows, the last along the axis."""
+    w = axis / torch.linalg.vector_norm(axis).clamp(min=1e-12)
+    helper = (
+        w.new_tensor([1.0, 0.0, 0.0]) if abs(float(w[0])) < math.sqrt(0.5) else w.new_tensor([0.0, 1.0, 0.0])
+    )
+    u = torch.linalg.cross(helper, w)
+    u = u / torch.linalg.vector_norm(u)
+    return torch.stack([u, torch.linalg.cross(w, u), w])
