@@ -190,7 +190,8 @@ def save_posed_set(posed_set: PosedSet, path: Path) -> None:
 
 def check_rotation(rotation: NDArray[np.float64]) -> str | None:
     """What is wrong with a [3, 3] rotation matrix, None = nothing."""
-    deviation = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
+    bounded = np.clip(rotation, -2.0, 2.0)  # no entry of a rotation exceeds 1; huge ones would overflow
+    deviation = float(np.abs(bounded @ bounded.T - np.eye(3)).max())
     if not deviation <= _ROTATION_TOLERANCE:
         return f"the rotation is not orthonormal (off by {deviation:.2g}, limit {_ROTATION_TOLERANCE:g})"
     if np.linalg.det(rotation) < 0:
@@ -215,7 +216,7 @@ def nearest_rotation(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _frame(
-    entry: Fields, shared: Fields, position: int, root: Path, splits: dict[str, frozenset[int]]
+    entry: Fields, shared: Fields, position: int, root: Path, splits: dict[str, frozenset[float]]
 ) -> PosedFrame:
     index = entry.integer("index", position, 0, _LARGEST_INDEX)
     file, mask, linear = (_path(entry, key, root) for key in ("file", "mask", "linear"))
@@ -283,14 +284,12 @@ def _path(entry: Fields, key: str, root: Path) -> Path | None:
     return root / name if name else None
 
 
-def _splits(fields: Fields) -> dict[str, frozenset[int]]:
+def _splits(fields: Fields) -> dict[str, frozenset[float]]:
     splits = fields.child("splits", None)
     if splits is None:
         return {}
     named = {key: splits.array(key, (None,), None) for key in ("flash", "val")}
-    return {
-        key: frozenset(values.astype(int).tolist()) for key, values in named.items() if values is not None
-    }
+    return {key: frozenset(values.tolist()) for key, values in named.items() if values is not None}
 
 
 def _transfer(fields: Fields) -> str:

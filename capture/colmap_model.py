@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from capture.atomic import atomic_write
 from capture.cameras import LARGEST_SIDE, Camera, check_intrinsics
 from capture.errors import SourceError
+from capture.json_fields import is_plain_text
 from capture.ply import PointCloud
 
 Key = TypeVar("Key")
@@ -225,6 +226,8 @@ def _posed(
     name: str, pose: Sequence[float], camera_id: int, intrinsics: Mapping[int, _Intrinsics], place: str
 ) -> tuple[str, Camera]:
     """Image name and camera of quaternion + translation."""
+    if not is_plain_text(name):
+        raise SourceError(f"{place}: the image name {name!r} contains a NUL.")
     norm = math.hypot(*pose[:4])
     if not all(map(math.isfinite, pose)) or not 1e-6 < norm < 1e6:
         raise SourceError(f"{place}: the pose of {name!r} is not a finite rotation and translation.")

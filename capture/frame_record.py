@@ -9,7 +9,7 @@ from dataclasses import dataclass, fields
 from pathlib import PurePosixPath
 
 from capture.cameras import LARGEST_SIDE
-from capture.json_fields import parse_json
+from capture.json_fields import is_plain_text, parse_json
 
 #: Reasons that keep a frame from being fitted; other reasons are remarks.
 EXCLUDING_REASONS = frozenset(
@@ -76,10 +76,8 @@ class FrameRecord:
         self._check_range("height", 1, LARGEST_SIDE)
         if self.flash is not None:
             self._check_range("flash", 0, 1)
-        if not isinstance(self.reasons, tuple | list) or not all(
-            isinstance(reason, str) for reason in self.reasons
-        ):
-            raise ValueError(f"reasons must be texts, not {self.reasons!r}")
+        if not isinstance(self.reasons, tuple | list) or not all(map(_is_reason, self.reasons)):
+            raise ValueError(f"reasons must be plain texts, not {self.reasons!r}")
         object.__setattr__(self, "reasons", tuple(self.reasons))
         if self.split not in (None, "train", "val"):
             raise ValueError(f'split is {self.split!r}, not "train", "val" or null')
@@ -93,6 +91,8 @@ class FrameRecord:
         if not isinstance(value, kind):
             raise ValueError(f"{name} is {value!r}, which is no {kind.__name__.lower()} value")
         value = convert(value)
+        if isinstance(value, str) and not is_plain_text(value):
+            raise ValueError(f"{name} is {value!r}, which is no plain text")
         if isinstance(value, float) and not math.isfinite(value):
             raise ValueError(f"{name} is {value}, not a finite number")
         object.__setattr__(self, name, value)
@@ -131,12 +131,10 @@ class FrameRecord:
         return cls(**values)
 
 
+def _is_reason(reason: object) -> bool:
+    return isinstance(reason, str) and is_plain_text(reason)
+
+
 def _is_inside(file: str) -> bool:
     path = PurePosixPath(file)
-    return (
-        bool(file)
-        and not path.is_absolute()
-        and ".." not in path.parts
-        and "\\" not in file
-        and "\0" not in file
-    )
+    return bool(file) and not path.is_absolute() and ".." not in path.parts and "\\" not in file

@@ -43,6 +43,11 @@ def parse_json(text: str | bytes) -> Any:
         raise ValueError("it is nested too deeply") from error
 
 
+def is_plain_text(text: str) -> bool:
+    """Whether a text can be a file's name: JSON can also say NUL and lone surrogates, which are no UTF-8."""
+    return "\0" not in text and not any("\ud800" <= character <= "\udfff" for character in text)
+
+
 def read_json(path: Path, error: type[RelightError]) -> Fields:
     """The object that a JSON file holds."""
     try:
@@ -87,8 +92,8 @@ class Fields:
             return default
         if not isinstance(value, str):
             raise self.fail(f'"{key}" must be a text, not {_kind(value)}.')
-        if "\0" in value:
-            raise self.fail(f'"{key}" contains a NUL character.')
+        if not is_plain_text(value):
+            raise self.fail(f'"{key}" contains a NUL or half of a surrogate pair.')
         return value
 
     def number(self, key: str, default: Any = _REQUIRED) -> Any:

@@ -26,6 +26,8 @@ from capture.ply import PointCloud, read_ply
 from capture.session import Session
 
 _PINHOLE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
+_FARTHEST = 1e30  # world units; float32, which clouds commonly have, ends at 3e38
+_LARGEST_SCALE = 1e9  # between a reconstruction's units and the file's
 _CV_FROM_GL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
@@ -142,6 +144,8 @@ def _pose(entry: Fields, file_from_original: NDArray[np.float64]) -> NDArray[np.
     cam_from_original: NDArray[np.float64] = _CV_FROM_GL @ np.linalg.inv(world_from_gl) @ file_from_original
     scale = np.cbrt(np.linalg.det(cam_from_original[:3, :3]))
     cam_from_original[:3] /= scale  # camera axes in the original's unit of length
+    if not np.abs(cam_from_original).max() < _FARTHEST:
+        raise entry.fail("the camera's position is out of any range.")
     cam_from_original[:3, :3] = nearest_rotation(cam_from_original[:3, :3])
     return cam_from_original
 
@@ -150,12 +154,11 @@ def _file_from_original(fields: Fields) -> NDArray[np.float64]:
     """[4, 4] similarity from the original reconstruction's world to the file's."""
     matrix = fields.affine("applied_transform") if "applied_transform" in fields else np.eye(4)
     matrix[:3] *= fields.number("applied_scale", 1.0)
-    scale = np.cbrt(np.linalg.det(matrix[:3, :3]))
-    if not scale > 1e-9 or check_rotation(matrix[:3, :3] / scale):
-        raise fields.fail(
-            "applied_transform and applied_scale must be a rotation, a positive scale and a shift."
-        )
-    return matrix
+    if np.abs(matrix).max() < _LARGEST_SCALE:
+        scale = np.cbrt(np.linalg.det(matrix[:3, :3]))
+        if scale > 1.0 / _LARGEST_SCALE and not check_rotation(matrix[:3, :3] / scale):
+            return matrix
+    raise fields.fail("applied_transform and applied_scale must be a rotation, a positive scale and a shift.")
 
 
 def _cloud(fields: Fields, root: Path, file_from_original: NDArray[np.float64]) -> PointCloud | None:
@@ -165,6 +168,8 @@ def _cloud(fields: Fields, root: Path, file_from_original: NDArray[np.float64]) 
     cloud = read_ply(root / name)
     original_from_file = np.linalg.inv(file_from_original)
     points = cloud.points @ original_from_file[:3, :3].T + original_from_file[:3, 3]
+    if not np.abs(points).max() < _FARTHEST:
+        raise fields.fail(f"applied_transform and applied_scale move points of {name} out of any range.")
     normals = cloud.normals
     if normals is not None:
         scale = np.cbrt(np.linalg.det(file_from_original[:3, :3]))

@@ -177,6 +177,7 @@ def test_a_binary_fisheye_is_refused_by_name(tmp_path):
         ("images.txt", "\n1 ", "\n1 nan 0 0 0 0 0 0 1 nan.png\n\n1 ", "not a finite rotation"),
         ("images.txt", "\n1 ", "\n1 x 0 0 0 0 0 0 1 x.png\n\n1 ", "line 2: .*'x'"),
         ("images.txt", "\n1 ", "\n1 2 3\n\n1 ", "line 2: an image has"),
+        ("images.txt", "frames/000001", "frames/\0", "contains a NUL"),
         ("cameras.txt", "64 48", "64 0", "image size 64 x 0"),
         ("cameras.txt", "64 48", "64 big", "line 2"),
         ("cameras.txt", "500.1", "-500.1", "focal"),

@@ -31,6 +31,7 @@ def test_a_file_without_an_object_is_the_callers_error(tmp_path, content):
     [
         (lambda f: f.text("a"), 3),
         (lambda f: f.text("a"), "nul\0"),
+        (lambda f: f.text("a"), "half \ud800"),
         (lambda f: f.number("a"), "3"),
         (lambda f: f.number("a"), 10**400),
         (lambda f: f.number("a"), float("nan")),

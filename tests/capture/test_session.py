@@ -111,22 +111,35 @@ def test_reading_changes_nothing_on_the_disk(made):
     assert before == {path: path.read_bytes() for path in made.rglob("*") if path.is_file()}
 
 
-def test_a_log_cut_at_any_byte_loses_at_most_its_last_frame_and_can_go_on(made):
+def cut_log(made, cut):
+    """Cuts the log; gives the number of whole lines and what is torn. A line that lacks only its newline is whole."""
     content = (made / "frames.jsonl").read_bytes()
-    ends = [at + 1 for at, byte in enumerate(content) if byte == 10]
+    (made / "frames.jsonl").write_bytes(content[:cut])
+    ends = [0, *(at + 1 for at, byte in enumerate(content) if byte == 10)]
+    whole = sum(end - 1 <= cut for end in ends[1:])
+    return whole, content[ends[whole] : cut]
+
+
+def test_a_log_cut_at_any_byte_loses_at_most_its_last_frame(made):
+    content = (made / "frames.jsonl").read_bytes()
     for cut in range(len(content) + 1):
-        (made / "frames.jsonl").write_bytes(content[:cut])
-        (made / "frames.torn").unlink(missing_ok=True)
+        (made / "frames.jsonl").write_bytes(content)
+        whole, torn = cut_log(made, cut)
         session = Session.open(made)
-        whole = sum(end - 1 <= cut for end in ends)  # a line that lacks only its newline is whole
-        assert len(session.frames) == whole
-        torn = content[:cut][([0, *ends])[whole] if whole < 3 else len(content) :]
+        assert [record.index for record in session.frames] == list(range(whole))
         assert len(session.repairs) == bool(torn)
-        with session:
-            append(session, 9)
-        assert [record.index for record in Session.open(made).frames] == [*range(whole), 9]
-        assert ((made / "frames.torn").read_bytes() if torn else b"") == (torn + b"\n" if torn else b"")
-        (made / "frames/000009.png").unlink()
+
+
+@pytest.mark.parametrize("back", [0, 1, 2, 40])
+def test_a_torn_line_is_kept_aside_when_recording_goes_on(made, back):
+    whole, torn = cut_log(made, (made / "frames.jsonl").stat().st_size - back)
+    with Session.open(made) as session:
+        append(session, 9)
+    again = Session.open(made)
+    assert [record.index for record in again.frames] == [*range(whole), 9]
+    assert again.repairs == []
+    assert (made / "frames.torn").exists() == bool(torn)
+    assert not torn or (made / "frames.torn").read_bytes() == torn + b"\n"
 
 
 def test_a_tail_of_zeros_as_file_systems_leave_it_is_a_torn_line(made):

@@ -139,6 +139,7 @@ def with_frame(**changes):
         (with_frame(transform_matrix=np.diag([1.0, 1, -1, 1]).tolist()), "frame 1: .*reflection"),
         (with_frame(transform_matrix=np.diag([2.0, 2, 2, 1]).tolist()), "frame 1: .*orthonormal"),
         (with_frame(transform_matrix=np.ones((4, 4)).tolist()), "frame 1: .*last row"),
+        (with_frame(transform_matrix=[[1, 0, 0, 1e200], [0, 1, 0, 0], [0, 0, 1, 0]]), "frame 1: .*range"),
         (with_frame(file_path="images/none.jpg"), "Frame 1"),
         (with_frame(flash="on"), "flash"),
     ],
