@@ -112,7 +112,7 @@ def test_reading_changes_nothing_on_the_disk(made):
 
 
 def cut_log(made, cut):
-    """Cuts the log; gives the number of whole lines and what is torn. A line that lacks only its newline is whole."""
+    """Cuts the log; gives the number of whole lines (one may lack its newline) and what is torn."""
     content = (made / "frames.jsonl").read_bytes()
     (made / "frames.jsonl").write_bytes(content[:cut])
     ends = [0, *(at + 1 for at, byte in enumerate(content) if byte == 10)]
