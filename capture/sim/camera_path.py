@@ -27,7 +27,7 @@ class CameraPath:
     distance_m: float = 0.58
     elevation_deg: float = 2.0
     tremor: float = 1.0
-    target: tuple[float, float, float] = (0.0, -0.045, 0.0)
+    target: tuple[float, float, float] = (0.0, -0.035, 0.0)
     seed: int = 0
 
     def cam_from_world(self, time_s: float) -> np.ndarray:

@@ -1,8 +1,8 @@
 """Light from far away: latitude-longitude maps, what a surface receives of them, and what it mirrors.
 
 A map is [H, W, 3] linear radiance; row i and column j look towards
-(sin theta sin phi, cos theta, -sin theta cos phi), theta = pi (i + .5) / H, phi = 2 pi (j + .5) / W. Tables over
-directions are octahedral squares (Cigolle et al. 2014), which are looked up without trigonometry.
+(sin theta sin phi, cos theta, -sin theta cos phi) with theta = pi (i + .5) / H and phi = 2 pi (j + .5) / W.
+Tables over directions are octahedral squares (Cigolle et al. 2014), looked up without trigonometry.
 """
 
 from __future__ import annotations

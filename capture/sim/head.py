@@ -1,8 +1,8 @@
 """The shape of a head, neck and shoulders as one implicit surface, sculpted from smooth unions.
 
 Head frame, in MILLIMETRES: +Y up, +Z where the face looks, +X the subject's left, the origin between the
-eyes' height and the middle of the skull (the head spans about y = -118 .. 115). The rest of the rig uses the same
-axes in metres. The body is mirrored in x and then bent a little, as faces are.
+eyes' height and the middle of the skull (the head spans about y = -118 .. 115). The rest of the rig uses the
+same axes in metres. The body is mirrored in x and then bent a little, as faces are.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from capture.sim.subject import Subject
 EYE_CENTRE = (32.0, 0.0, 73.5)
 EYE_RADIUS = 12.0
 MOUTH_HEIGHT = -76.0
-BUST_FLOOR = -300.0
-BOUNDS = (np.array([-262.0, -308.0, -140.0]), np.array([262.0, 132.0, 140.0]))
+BUST_FLOOR = -352.0
+BOUNDS = (np.array([-266.0, -360.0, -140.0]), np.array([266.0, 136.0, 140.0]))
 
 
 @dataclass(frozen=True)

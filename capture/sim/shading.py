@@ -100,13 +100,13 @@ def point_light(
 def _lobe(bust: Bust, chosen: np.ndarray, normals: np.ndarray, half: np.ndarray) -> np.ndarray:
     """Blinn-Phong lobe [C], energy-conserving, times pi; around the strand for hair (Kajiya-Kay 1989)."""
     exponent = np.where(bust.wet[chosen], np.float32(_WET_EXPONENT), np.float32(_SKIN_EXPONENT))
-    cosine = np.clip(np.einsum("vc,vc->v", half, normals), 0.0, 1.0)
+    cosine = np.clip(np.einsum("vc,vc->v", half, normals), 1e-6, 1.0)
     strand = chosen >= bust.strand_start
     if strand.any():
         along = np.einsum("vc,vc->v", half[strand], bust.tangents[chosen[strand]])
-        cosine[strand] = np.sqrt(np.clip(1.0 - along * along, 0.0, 1.0))
+        cosine[strand] = np.sqrt(np.clip(1.0 - along * along, 1e-6, 1.0))
         exponent[strand] = _STRAND_EXPONENT
-    return (exponent + 8.0) / 8.0 * cosine**exponent
+    return (exponent + 8.0) / 8.0 * np.exp(exponent * np.log(cosine))
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:

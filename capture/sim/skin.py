@@ -50,7 +50,7 @@ def paint_skin(points: np.ndarray, shape: HeadShape) -> tuple[np.ndarray, np.nda
     beard = np.maximum(beard * smooth_step(z + 0.8 * np.abs(y + 80), 30, 60), moustache) * s.stubble
     beard *= 0.8 + 0.5 * value_noise(points, 1.7, s.seed + 45)
     lips = shape.lip_mask(points)
-    blood = blood * (1 - lips) + lips * (0.85 + 0.2 * value_noise(points * [1, 0.3, 0.3], 2.2, s.seed + 46))
+    blood = blood * (1 - lips) + lips * (1.1 + 0.2 * value_noise(points * [1, 0.3, 0.3], 2.2, s.seed + 46))
     log_loss = np.clip(blood, -0.2, 1.4)[:, None] * _BLOOD + np.clip(melanin, -0.3, 1.6)[:, None] * _MELANIN
     albedo = np.array(s.skin) * np.exp(-log_loss)
     albedo *= 1.0 - 0.42 * np.clip(beard, 0, 1)[:, None] * np.array([1.0, 0.9, 0.75])

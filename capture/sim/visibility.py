@@ -18,8 +18,8 @@ from capture.sim.environment import Environment, fibonacci_directions
 from capture.sim.rasterize import Raster, project
 
 _FAR_LIGHT_M = 12.0  # so far that its rays are parallel to 1.5 degrees over the bust
-_TARGET = np.array([0.0, -0.09, -0.01])
-_REACH_M = 0.34  # radius of the ball around _TARGET that the bust fills
+_TARGET = np.array([0.0, -0.11, -0.01])
+_REACH_M = 0.37  # radius of the ball around _TARGET that the bust fills
 
 
 def view_from(position: np.ndarray, target: np.ndarray, reach_m: float, size: int) -> Camera:
@@ -64,7 +64,7 @@ def depth_visibility(raster: Raster, points: np.ndarray, bias_m: float, soft_m: 
     return total
 
 
-def point_visibility(bust: Bust, position: np.ndarray, chosen: np.ndarray, size: int = 1024) -> np.ndarray:
+def point_visibility(bust: Bust, position: np.ndarray, chosen: np.ndarray, size: int = 800) -> np.ndarray:
     """Share of a point light's rays [C] that reach the chosen vertices ([C] indices)."""
     raster = Raster.empty(view_from(position, _TARGET, _REACH_M, size))
     raster.draw(bust.vertices, bust.triangles, None)
