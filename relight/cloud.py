@@ -1,15 +1,16 @@
 """From the given point cloud to an even, smooth sampling of the surface with normals.
 
-A dense stereo cloud is noisy along the viewing rays, has outliers and holes, and its spacing has nothing to do with
-the pixels. The steps, all in multiples of the cloud's own spacing so that the unit of length does not matter:
+A dense stereo cloud is noisy along the viewing rays, has outliers and holes, and its spacing has nothing to
+do with the pixels. The steps, all in multiples of the cloud's own spacing so that the unit of length does
+not matter:
 
 1. `clean`: points without near neighbours, or outside the subject's masks, go.
-2. `smooth`: planes fitted to neighbourhoods as large as the noise asks for, with a robust quadratic for the heights
-   (moving least squares: Alexa et al. 2003, "Computing and rendering point set surfaces").
+2. `smooth`: planes fitted to neighbourhoods as large as the noise asks for, with a robust quadratic for the
+   heights (moving least squares: Alexa et al. 2003, "Computing and rendering point set surfaces").
 3. `orient`: normals turned to the cameras that see the point.
 4. `relight.holes`: holes of a few centimetres on a head are filled.
-5. `resample`: discs around the smooth points filled with new ones, thinned to the wanted spacing and projected onto
-   the surface: fine enough for the pixels.
+5. `resample`: discs around the smooth points filled with new ones, thinned to the wanted spacing and
+   projected onto the surface: fine enough for the pixels.
 
 Neighbours are found by scipy's k-d tree on the CPU; the sums run in torch.
 """
@@ -49,9 +50,9 @@ class CloudConfig:
 
     Attributes:
         outlier_factor: A point whose 8th neighbour is further than this many times the median is an outlier.
-        smoothing: Radius of the smoothing disc is `smoothing * spacing * (noise / spacing)^(1/3)`: a plane's slope
-            error falls with radius^2 and the bias of curvature grows with it, so the best radius goes with the cube
-            root of the noise. The factor was found on clouds with known normals.
+        smoothing: Radius of the smoothing disc is `smoothing * spacing * (noise / spacing)^(1/3)`: a
+            plane's slope error falls with radius^2 and the bias of curvature grows with it, so the best
+            radius goes with the cube root of the noise. The factor was found on clouds with known normals.
         footprint: Wanted spacing of the result in pixels of the nearest views.
         max_points: The spacing is widened to keep about this many points.
         widest_hole: Holes up to this many spacings of the given cloud are filled.
@@ -101,8 +102,8 @@ def prepare_cloud(
     keep = clean(points, config.outlier_factor)
     if len(keep) < FEWEST_POINTS:
         raise PlanError(
-            f"Only {len(keep)} of {len(points)} points of the cloud lie close enough to others to form a surface; "
-            "a fit needs a dense cloud."
+            f"Only {len(keep)} of {len(points)} points of the cloud lie close enough to others to form a "
+            "surface; a fit needs a dense cloud."
         )
     points = np.ascontiguousarray(points[keep], dtype=np.float32)
     hints = None if normals_world is None else normals_world[keep]
@@ -122,7 +123,7 @@ def prepare_cloud(
 
 def clean(points: Floats, outlier_factor: float) -> NDArray[np.int64]:
     """Indices of the finite points that have neighbours as near as the others have."""
-    finite = np.isfinite(points).all(axis=1).nonzero()[0]
+    finite = np.flatnonzero(np.isfinite(points).all(axis=1))
     if len(finite) <= _OUTLIER_NEIGHBOURS:
         return finite[:0]
     # Copies of one point are one point, and would make every other look like an outlier.
@@ -152,8 +153,8 @@ def smooth(points: Floats, radius: float) -> tuple[Floats, Floats]:
 
     Args:
         points: [P, 3].
-        radius: Standard deviation of the Gaussian weight; the neighbourhood ends at about one radius, where the
-            weights are still 0.6, because the tails would cost more neighbours than they add.
+        radius: Standard deviation of the Gaussian weight; the neighbourhood ends at about one radius, where
+            the weights are still 0.6, because the tails would cost more neighbours than they add.
     """
     spacing = _mean_spacing(points)
     neighbours = int(np.clip(math.pi * (radius / spacing) ** 2, 12, _MOST_NEIGHBOURS))
@@ -171,10 +172,11 @@ def smooth(points: Floats, radius: float) -> tuple[Floats, Floats]:
 
 
 def orient(points: Floats, normals: Floats, cameras: Sequence[Camera], hints: Floats | None = None) -> Floats:
-    """Normals turned towards the cameras that see their points, or towards the given hints where there are any.
+    """Normals turned towards the cameras that see their points, or towards the given hints where there are
+    any.
 
-    Which camera sees a point is told from a coarse z-buffer, without normals. Where that is undecided, as at the
-    edge of what any camera saw, the majority of the neighbours decides.
+    Which camera sees a point is told from a coarse z-buffer, without normals. Where that is undecided, as
+    at the edge of what any camera saw, the majority of the neighbours decides.
     """
     cloud = torch.from_numpy(points)
     towards = torch.zeros_like(cloud)
@@ -199,9 +201,9 @@ def orient(points: Floats, normals: Floats, cameras: Sequence[Camera], hints: Fl
 def resample(points: Floats, normals: Floats, spacing: float) -> tuple[Floats, Floats]:
     """The surface of the given points sampled at another spacing.
 
-    Each point stands for a disc in its tangent plane, as wide as its neighbours are apart, so gaps of up to twice
-    that are closed. Discs are filled in a sunflower pattern, one candidate is kept a cube of the wanted spacing, and
-    the kept ones are projected onto the surface.
+    Each point stands for a disc in its tangent plane, as wide as its neighbours are apart, so gaps of up to
+    twice that are closed. Discs are filled in a sunflower pattern, one candidate is kept a cube of the
+    wanted spacing, and the kept ones are projected onto the surface.
     """
     base = _mean_spacing(points)
     radius = 1.3 * base
@@ -260,7 +262,8 @@ def _planes(
 def _quadratic_heights(
     points: Floats, ids: NDArray[np.int64], weights: Floats, normals: Floats, at: Floats, radius: float
 ) -> Floats:
-    """Height over `at`, along the normal, of a quadratic fitted to each neighbourhood, robust by one reweighting."""
+    """Height over `at`, along the normal, of a quadratic fitted to each neighbourhood, robust by one
+    reweighting."""
     offsets = torch.from_numpy(points[ids] - at[:, None]) / radius
     x, y, z = (
         (offsets @ torch.from_numpy(axis)[..., None])[..., 0] for axis in (*tangents(normals), normals)
@@ -276,12 +279,14 @@ def _quadratic_heights(
         residual = z - (basis @ coefficients[..., None])[..., 0]
         scale = 1.5 * (weight * residual.abs()).sum(1, keepdim=True) / weight.sum(1, keepdim=True)
         weight = weight / (1.0 + (residual / (2.0 * scale + 1e-6)) ** 2)  # Cauchy
-    # A smooth surface is near its points: what moves further than half the disc was no neighbourhood of one sheet.
+    # A smooth surface is near its points: what moves further than half the disc was no neighbourhood of one
+    # sheet.
     return (coefficients[:, 0].clamp(-0.5, 0.5) * radius).numpy()
 
 
 def _unoccluded(cloud: torch.Tensor, camera: Camera, spacing: float) -> tuple[torch.Tensor, torch.Tensor]:
-    """Whether a camera sees each point [P] bool, by a z-buffer of cells some points wide, and unit directions to it."""
+    """Whether a camera sees each point [P] bool, by a z-buffer of cells some points wide, and unit
+    directions to it."""
     uv_px, z = project(cloud, camera)
     cell = max(4.0, 4.0 * spacing * float(camera.K[0, 0]) / max(float(z.median()), NEAR_M))
     columns, rows = int(camera.width / cell) + 1, int(camera.height / cell) + 1
@@ -296,7 +301,8 @@ def _unoccluded(cloud: torch.Tensor, camera: Camera, spacing: float) -> tuple[to
 
 
 def _thin(points: Floats, hints: Floats | None, cell: float) -> tuple[Floats, Floats | None]:
-    """Points averaged over cubes, with their hints; as they are where the cubes are about as small as the spacing."""
+    """Points averaged over cubes, with their hints; as they are where the cubes are about as small as the
+    spacing."""
     if cell < 1.2 * _mean_spacing(points):
         return points, hints
     _, group, counts = np.unique(_cubes(points, cell), return_inverse=True, return_counts=True)
@@ -331,7 +337,8 @@ def _mean_spacing(points: Floats) -> float:
 
 
 def _nearest_footprint(points: Floats, cameras: Sequence[Camera]) -> float:
-    """World size of a pixel on the subject, in the nearer views (20th percentile over views of the median depth)."""
+    """World size of a pixel on the subject, in the nearer views (20th percentile over views of the median
+    depth)."""
     sizes = []
     sample = torch.from_numpy(points[:: max(1, len(points) // 5_000)])
     for camera in cameras:

@@ -1,8 +1,10 @@
-"""Small holes of a surface's point cloud, found and filled with the quadratic that continues their surroundings.
+"""Small holes of a surface's point cloud, found and filled with the quadratic that continues their
+surroundings.
 
-A point at the edge of a hole or of the cloud has no neighbours on one side (largest angular gap in the tangent plane:
-Bendels et al. 2006, "Detecting holes in point set surfaces"). Edge points that lie close together make a rim. A small
-rim is a hole's; the rim of the whole cloud, as below the shoulders, is large and stays open.
+A point at the edge of a hole or of the cloud has no neighbours on one side (largest angular gap in the
+tangent plane: Bendels et al. 2006, "Detecting holes in point set surfaces"). Edge points that lie close
+together make a rim. A small rim is a hole's; the rim of the whole cloud, as below the shoulders, is large
+and stays open.
 """
 
 from __future__ import annotations
@@ -16,7 +18,6 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from relight.tangents import tangents
-
 
 Floats = NDArray[np.float32]
 
@@ -85,7 +86,8 @@ def _rims(points: Floats, link: float) -> list[NDArray[np.int64]]:
 def _patch(
     points: Floats, normals: Floats, tree: cKDTree, rim: NDArray[np.int64], spacing: float
 ) -> tuple[Floats, Floats] | None:
-    """New points and normals inside a rim, None where it encloses nothing or its surroundings are no patch."""
+    """New points and normals inside a rim, None where it encloses nothing or its surroundings are no
+    patch."""
     centre = points[rim].mean(axis=0)
     normal = normals[rim].mean(axis=0)
     if np.linalg.norm(normal) < 0.3:

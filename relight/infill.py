@@ -1,8 +1,8 @@
 """Values for the points that the light did not reach, from those that it did.
 
-Behind the ears, under the chin and on the crown no flash frame says anything. Left at zero such points would be black
-under every new light; here they take the weighted mean of the nearest points that are known, and the two are blended
-by how much the point itself has seen.
+Behind the ears, under the chin and on the crown no flash frame says anything. Left at zero such points
+would be black under every new light; here they take the weighted mean of the nearest points that are known,
+and the two are blended by how much the point itself has seen.
 """
 
 from __future__ import annotations

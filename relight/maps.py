@@ -1,10 +1,11 @@
 """Maps of a portrait from any view: its points splatted, holes filled, and a soft mask.
 
-Visible points are spread over 3x3 pixels with a Gaussian as wide as half their spacing on the screen, and the sums
-divided by the weights (Zwicker et al. 2001, "Surface splatting", with screen-aligned splats). What lies between the
-points is filled by pull-push (Gortler et al. 1996, "The lumigraph"): averaged down a pyramid where there are weights,
-and read back up where there are none. The mask is where the splats cover, closed over gaps of a pixel; holes that are
-enclosed and small are the cloud's, not the subject's, and are filled too.
+Visible points are spread over 3x3 pixels with a Gaussian as wide as half their spacing on the screen, and
+the sums divided by the weights (Zwicker et al. 2001, "Surface splatting", with screen-aligned splats). What
+lies between the points is filled by pull-push (Gortler et al. 1996, "The lumigraph"): averaged down a
+pyramid where there are weights, and read back up where there are none. The mask is where the splats cover,
+closed over gaps of a pixel; holes that are enclosed and small are the cloud's, not the subject's, and are
+filled too.
 """
 
 from __future__ import annotations
@@ -130,7 +131,8 @@ def pull_push(sums: torch.Tensor, full: float) -> torch.Tensor:
         pyramid.append((values, (4.0 * total).clamp(max=1.0)))
     values, share = pyramid.pop()
     for finer, finer_share in reversed(pyramid):
-        # What the coarser level knows is weighted by how much it knows, or empty pixels would darken their neighbours.
+        # What the coarser level knows is weighted by how much it knows, or empty pixels would darken their
+        # neighbours.
         both = torch.nn.functional.interpolate(
             torch.cat([values * share, share])[None],
             size=finer.shape[1:],
@@ -176,7 +178,8 @@ def _splat(
 
 
 def _soft_mask(covered: NDArray[np.bool_]) -> torch.Tensor:
-    """Coverage [H, W] 0..1 of covered pixels: gaps of a pixel and small enclosed holes closed, edges two pixels soft."""
+    """Coverage [H, W] 0..1 of covered pixels: gaps of a pixel and small enclosed holes closed, edges two
+    pixels soft."""
     mask = cv2.morphologyEx(covered.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
     height, width = mask.shape
     count, labels, statistics, _ = cv2.connectedComponentsWithStats(1 - mask, connectivity=4)

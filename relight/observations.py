@@ -1,8 +1,8 @@
 """What every point of the surface looks like in every frame that sees it.
 
-Occlusion is told from a z-buffer of cells a few points wide: the nearest depth in the 3x3 cells about a point, and a
-tolerance that grows with the slant of the surface across these cells. So no hole between points lets light through
-from behind, and a slanted surface does not hide itself.
+Occlusion is told from a z-buffer of cells a few points wide: the nearest depth in the 3x3 cells about a
+point, and a tolerance that grows with the slant of the surface across these cells. So no hole between
+points lets light through from behind, and a slanted surface does not hide itself.
 """
 
 from __future__ import annotations
@@ -28,12 +28,13 @@ class Observations:
 
     Attributes:
         radiance: [K, P, 3] float32, linear; 0 where there is none.
-        cosine: [K, P] float32, between normal and direction to the camera; 0 where the frame does not see the point,
-            or sees it clipped or outside the mask.
+        cosine: [K, P] float32, between normal and direction to the camera; 0 where the frame does not see
+            the point, or sees it clipped or outside the mask.
         flash: [K] bool.
         flash_position_world: [K, 3].
-        outside: [P] float32, share of the frames with a mask, of those that have the point in the picture, in which
-            it lies outside the mask: what is off the subject in a frame is not the subject, whether seen or hidden.
+        outside: [P] float32, share of the frames with a mask, of those that have the point in the picture,
+            in which it lies outside the mask: what is off the subject in a frame is not the subject,
+            whether seen or hidden.
     """
 
     radiance: torch.Tensor
@@ -100,13 +101,14 @@ def visible_points(
         normals: [P, 3], unit, world.
         camera: Without distortion.
         spacing: Of the points, world units.
-        cell: Width of a z-buffer cell in spacings, and at least two pixels. With 4.8 some twenty points fall into a
-            cell and none is empty; smaller ones resolve finer occluders.
+        cell: Width of a z-buffer cell in spacings, and at least two pixels. With 4.8 some twenty points
+            fall into a cell and none is empty; smaller ones resolve finer occluders.
         tolerance: Depth in spacings that does not hide: the noise of a dense cloud stays within 7.5.
 
     Returns:
-        uv_px [P, 2]; cosine [P] between the normal and the direction to the camera, 0 where the point is hidden, turned
-        away or outside the picture; inside [P] bool, whether it projects into the picture at all.
+        uv_px [P, 2]; cosine [P] between the normal and the direction to the camera, 0 where the point is
+        hidden, turned away or outside the picture; inside [P] bool, whether it projects into the picture at
+        all.
     """
     uv_px, z = project(points, camera)
     inside = (z > NEAR_M) & (uv_px >= 0).all(dim=1)
@@ -130,7 +132,8 @@ def visible_points(
 
 
 def sample_bilinear(image: torch.Tensor, uv_px: torch.Tensor) -> torch.Tensor:
-    """Values [P, C] of an image [C, H, W] at pixel positions [P, 2], centres at 0.5, the border repeated outside."""
+    """Values [P, C] of an image [C, H, W] at pixel positions [P, 2], centres at 0.5, the border repeated
+    outside."""
     height, width = image.shape[1:]
     grid = uv_px / uv_px.new_tensor([width, height]) * 2.0 - 1.0
     return torch.nn.functional.grid_sample(

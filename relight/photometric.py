@@ -1,31 +1,33 @@
 """Photometric solve: albedo, normals and room shading of every point from flash and no-flash frames.
 
-With poses and points known the light model (Sevastopolsky 2020, eq. 4) is nearly linear per point. In a no-flash
-frame a point shows its room radiance; a flash frame adds
+With poses and points known the light model (Sevastopolsky 2020, eq. 4) is nearly linear per point. In a
+no-flash frame a point shows its room radiance; a flash frame adds
 
     q = (L - room) d^2 / C_flash = albedo * diffuse(<n, l>) + gloss(<n, l>)
 
 (`relight.reflectance`), seen under as many light directions l as there are flash frames. The steps:
 
 1. room radiance: robust mean over the no-flash frames;
-2. the scale of C_flash, the three reflectance numbers of the subject, and a gain for each flash frame (lamps droop);
-3. normals: robust least squares for b = albedo * n under the frames' light directions (Woodham 1980), with the
-   geometric normal as a prior in the directions that the lights do not span. The prior's weight is the ratio of the
-   two variances, the photometric one measured from the residual;
+2. the scale of C_flash, the three reflectance numbers of the subject, and a gain for each flash frame
+   (lamps droop);
+3. normals: robust least squares for b = albedo * n under the frames' light directions (Woodham 1980), with
+   the geometric normal as a prior in the directions that the lights do not span. The prior's weight is the
+   ratio of the two variances, the photometric one measured from the residual;
 4. albedo: robust least squares per channel;
 5. points that the flash did not reach are filled from their neighbours (`relight.infill`).
 
-Robust: frames in which gloss, a shadow, a wrong visibility or a moved pose spoils a point lose weight by a Cauchy
-function of their residual. Clipped pixels never had any.
+Robust: frames in which gloss, a shadow, a wrong visibility or a moved pose spoils a point lose weight by a
+Cauchy function of their residual. Clipped pixels never had any.
 
-Units: radiance 1.0 = white clip. Only albedo * C is observable, so a scale has to be chosen: the brightest twentieth
-of the points that the flash saw has albedo `ALBEDO_95` (mean of the channels), and the flash is taken for white.
+Units: radiance 1.0 = white clip. Only albedo * C is observable, so a scale has to be chosen: the brightest
+twentieth of the points that the flash saw has albedo `ALBEDO_95` (mean of the channels), and the flash is
+taken for white.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 
@@ -39,7 +41,8 @@ from relight.scene import Scene
 from relight.stages import Progress, no_progress
 
 ALBEDO_95 = 0.6
-"""Mean-channel albedo given to the 95th percentile of the points: that of fair skin, in the middle of the range."""
+"""Mean-channel albedo given to the 95th percentile of the points: that of fair skin, in the middle of the
+range."""
 
 _CHUNK = 1 << 16  # points at a time: [K, chunk, 3] arrays stay in tens of megabytes
 _SAMPLE = 20_000  # points from which global quantities are fitted
@@ -58,13 +61,14 @@ class SolveConfig:
     Attributes:
         cloud: How the cloud is prepared.
         normal_sigma_rad: Standard error of the geometric normals, the weight of the prior.
-        fit_gloss: Whether the subject's gloss and retro-reflection are fitted; otherwise it is taken as Lambertian.
+        fit_gloss: Whether the subject's gloss and retro-reflection are fitted; otherwise it is taken as
+            Lambertian.
         fit_gains: Whether the flash frames' gains are fitted; otherwise all flashes are taken as equal.
-        known: Information (sum of weighted squared cosines over the flash frames) that makes an albedo known: 0.25 is
-            one flash frame at 60 degrees.
+        known: Information (sum of weighted squared cosines over the flash frames) that makes an albedo
+            known: 0.25 is one flash frame at 60 degrees.
     """
 
-    cloud: CloudConfig = CloudConfig()
+    cloud: CloudConfig = field(default_factory=CloudConfig)
     normal_sigma_rad: float = 0.06
     fit_gloss: bool = True
     fit_gains: bool = True
@@ -99,7 +103,8 @@ def solve(scene: Scene, config: SolveConfig = SolveConfig(), progress: Progress 
         progress: Told ("cloud" | "observe" | "solve", fraction).
 
     Raises:
-        PlanError: There are no flash or no no-flash frames, or too few points, or the frames do not see the cloud.
+        PlanError: There are no flash or no no-flash frames, or too few points, or the frames do not see the
+            cloud.
     """
     flags = [view.flash for view in scene.views]
     if not any(flags) or all(flags):
@@ -115,7 +120,8 @@ def solve(scene: Scene, config: SolveConfig = SolveConfig(), progress: Progress 
     progress("solve", 0.0)
     points = torch.from_numpy(surface.points).to(scene.device)
     prior = torch.from_numpy(surface.normals_world).to(scene.device)
-    # What masks carve away takes no part; it is dropped at the end, for a copy of the observations would be large.
+    # What masks carve away takes no part; it is dropped at the end, for a copy of the observations would be
+    # large.
     on_subject = observations.outside <= _OUTSIDE_LIMIT
     observations.cosine.mul_(on_subject)
     if not bool((observations.cosine > 0).any()):
@@ -138,8 +144,8 @@ def solve(scene: Scene, config: SolveConfig = SolveConfig(), progress: Progress 
     known = information > config.known
     if not bool(known.any()):
         raise PlanError(
-            "The flash frames do not light any point enough to solve for it; is the flash flag of the frames right, "
-            "and is the subject what the flash lights?"
+            "The flash frames do not light any point enough to solve for it; is the flash flag of the frames "
+            "right, and is the subject what the flash lights?"
         )
     albedo = infill(points, albedo, information, known=config.known, nearest=surface.spacing)
     room = infill(points, room, room_information, known=0.3, nearest=surface.spacing)
@@ -177,7 +183,8 @@ def solve(scene: Scene, config: SolveConfig = SolveConfig(), progress: Progress 
 
 
 def _room_radiance(observations: Observations) -> tuple[torch.Tensor, torch.Tensor]:
-    """Robust mean over the no-flash frames [P, 3], and the sum of weights [P]; 0 where no frame sees the point."""
+    """Robust mean over the no-flash frames [P, 3], and the sum of weights [P]; 0 where no frame sees the
+    point."""
     dark = ~observations.flash
     rooms, informations = [], []
     for part in _chunks(observations.cosine.shape[1]):
@@ -212,7 +219,8 @@ def _flash_part(
 def _global_quantities(
     flash: _Flash, normals: torch.Tensor, config: SolveConfig
 ) -> tuple[float, Reflectance, torch.Tensor]:
-    """Scale of C_flash, reflectance of the subject and gain of each flash frame [K], from a sample of the points."""
+    """Scale of C_flash, reflectance of the subject and gain of each flash frame [K], from a sample of the
+    points."""
     step = max(1, flash.weight.shape[1] // _SAMPLE)
     sample = slice(None, None, step)
     gains = flash.response.new_ones(len(flash.response))
@@ -240,7 +248,8 @@ def _global_quantities(
 def _frame_gains(
     cosine: torch.Tensor, response: torch.Tensor, weight: torch.Tensor, reflectance: Reflectance
 ) -> torch.Tensor:
-    """Gain of each frame [K] against the points' albedos from all frames: a median of ratios; 1 on the whole."""
+    """Gain of each frame [K] against the points' albedos from all frames: a median of ratios; 1 on the
+    whole."""
     diffuse, gloss = reflectance.diffuse(cosine), reflectance.gloss(cosine)
     weight = weight * (cosine > 0.5)
     norm = (weight * diffuse**2).sum(dim=0)
@@ -307,7 +316,8 @@ def _fit_normals(
 def _fit_albedo(
     flash: _Flash, normals: torch.Tensor, reflectance: Reflectance, relative: float | None
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Albedo [P, C], information [P], relative residual [P] and standard error [P]; without `relative` not robust."""
+    """Albedo [P, C], information [P], relative residual [P] and standard error [P]; without `relative` not
+    robust."""
     cosine = flash.cosine(normals)
     diffuse = reflectance.diffuse(cosine)
     matte = flash.response - reflectance.gloss(cosine)[..., None]
@@ -330,9 +340,11 @@ def _fit_albedo(
 def _split_room(
     room: torch.Tensor, albedo: torch.Tensor, known: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """C_room [3] and shading [P] 0..1 with room = albedo C_room s as nearly as a grey s can (eq. 4, first term).
+    """C_room [3] and shading [P] 0..1 with room = albedo C_room s as nearly as a grey s can (eq. 4, first
+    term).
 
-    The colour is the median of room / albedo where the albedo is known; the scale makes the brightest hundredth 1.
+    The colour is the median of room / albedo where the albedo is known; the scale makes the brightest
+    hundredth 1.
     """
     ratio = room / albedo.clamp(min=_FLOOR)
     used = known & (albedo.mean(dim=1) > 10 * _FLOOR)
@@ -349,7 +361,8 @@ def _split_room(
 
 def _normal_sigma(information: torch.Tensor, relative: float, prior_sigma: float) -> torch.Tensor:
     """Standard error of the normal, radians: prior and flash frames together."""
-    # A cosine c changes by sin per radian: tangential information is that of the frames times about tan^2 = 0.5.
+    # A cosine c changes by sin per radian: tangential information is that of the frames times about tan^2 =
+    # 0.5.
     photometric = 0.5 * information / relative**2
     return (1.0 / (1.0 / prior_sigma**2 + photometric)).sqrt()
 
@@ -360,7 +373,8 @@ def _chunks(count: int) -> Iterator[slice]:
 
 
 def _sampled(values: torch.Tensor) -> torch.Tensor:
-    """At most about a million values: torch.quantile takes no more than 16 million, and needs no more than these."""
+    """At most about a million values: torch.quantile takes no more than 16 million, and needs no more than
+    these."""
     return values[:: max(1, len(values) // 1_000_000)]
 
 

@@ -48,9 +48,10 @@ class Portrait:
     Attributes:
         points: [P, 3] world.
         normals_world: [P, 3] unit.
-        albedo: [P, 3] linear. Its scale is a convention (see `relight.photometric`): only albedo * C is observable.
-        room_radiance: [P, 3] linear radiance under the room's light, colour of the room's light included. The paper's
-            A * C_room * s is its grey approximation.
+        albedo: [P, 3] linear. Its scale is a convention (see `relight.photometric`): only albedo * C is
+            observable.
+        room_radiance: [P, 3] linear radiance under the room's light, colour of the room's light included.
+            The paper's A * C_room * s is its grey approximation.
         shading: [P] room shading s, 0..1.
         confidence: [P] 0..1, how well the flash observed the point; 0 = filled in from neighbours.
         albedo_sigma: [P] standard error of the albedo (mean of channels), infinite nowhere: 1 where unknown.

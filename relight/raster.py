@@ -2,16 +2,17 @@
 
 The raw images S[0], ..., S[T] of the paper (Sevastopolsky et al. 2020, section 3.2, after NPBG, Aliev et al.
 2020): per pixel the nearest point that projects into it, at several scales. Point positions and poses do not
-change during a fit, so the result kept here is the *id* of that point; descriptors are looked up through the ids
-(`gather_descriptors`), which is where the gradient flows.
+change during a fit, so the result kept here is the *id* of that point; descriptors are looked up through
+the ids (`gather_descriptors`), which is where the gradient flows.
 
-How it is fast: depth (as the bits of a positive float32, which sort like the number) and point id share one 64-bit
-key, so the z-test is one `scatter_reduce(amin)` and its result does not depend on the order of the points. A coarser
-level is the minimum over 2x2 keys of the finer one: exactly what projecting the points again would give, at a
-quarter of the pixels instead of all of the points. No compiler is needed, and the same code runs on CUDA.
+How it is fast: depth (as the bits of a positive float32, which sort like the number) and point id share one
+64-bit key, so the z-test is one `scatter_reduce(amin)` and its result does not depend on the order of the
+points. A coarser level is the minimum over 2x2 keys of the finer one: exactly what projecting the points
+again would give, at a quarter of the pixels instead of all of the points. No compiler is needed, and the
+same code runs on CUDA.
 
-Pixel (0, 0) covers [0, 1) x [0, 1); depth is z along the optical axis in metres; points at or behind `NEAR_M`,
-outside the picture, or with a non-finite coordinate are left out.
+Pixel (0, 0) covers [0, 1) x [0, 1); depth is z along the optical axis in metres; points at or behind
+`NEAR_M`, outside the picture, or with a non-finite coordinate are left out.
 """
 
 from __future__ import annotations
@@ -35,7 +36,8 @@ class IdPyramid:
     """Nearest point per pixel at every scale.
 
     Attributes:
-        ids: level t is [ceil(H / 2^t), ceil(W / 2^t)] int64, the index of the nearest point, -1 where there is none.
+        ids: level t is [ceil(H / 2^t), ceil(W / 2^t)] int64, the index of the nearest point, -1 where there
+            is none.
         depth_m: as `ids`, float32, z of that point, +inf where there is none.
     """
 
@@ -51,7 +53,8 @@ def project(points_world: torch.Tensor, camera: Camera) -> tuple[torch.Tensor, t
         camera: its `K` and `cam_from_world` are used; images are undistorted before they reach this code.
 
     Returns:
-        uv_px [P, 2] with pixel centres at 0.5, and z_m [P]. Behind the camera (z <= 0) uv_px has no meaning: test z.
+        uv_px [P, 2] with pixel centres at 0.5, and z_m [P]. Behind the camera (z <= 0) uv_px has no
+        meaning: test z.
     """
     cam_from_world = torch.as_tensor(camera.cam_from_world, dtype=torch.float64)
     # One matrix for rotation and intrinsics, multiplied in float64, spares a pass over the points.
@@ -71,8 +74,8 @@ def rasterize_ids(points_world: torch.Tensor, camera: Camera, levels: int = 1) -
         levels: number of scales, at least 1.
 
     Returns:
-        The nearest point of every pixel at each scale. Equal depths go to the lower id, so the result is the same
-        for any number of threads and on any device.
+        The nearest point of every pixel at each scale. Equal depths go to the lower id, so the result is
+        the same for any number of threads and on any device.
 
     Raises:
         ValueError: if `levels` < 1 or there are too many points.

@@ -1,17 +1,18 @@
 """How the subject's surface reflects light beyond Lambert, with three numbers.
 
-With the lamp next to the lens, light and view direction are one and reflectance depends on a single angle: c, the
-cosine between it and the normal. Two effects bend the curve away from Lambert's c on skin and most else: the
-retro-reflection of rough surfaces towards grazing angles (Burley 2012, "Physically based shading at Disney",
-section 5.3) and gloss at normal incidence (GGX, Walter et al. 2007). Per point, albedo and normal would have to
-explain both; as three numbers of the whole subject they can be fitted from all points and frames at once:
+With the lamp next to the lens, light and view direction are one and reflectance depends on a single angle:
+c, the cosine between it and the normal. Two effects bend the curve away from Lambert's c on skin and most
+else: the retro-reflection of rough surfaces towards grazing angles (Burley 2012, "Physically based shading
+at Disney", section 5.3) and gloss at normal incidence (GGX, Walter et al. 2007). Per point, albedo and
+normal would have to explain both; as three numbers of the whole subject they can be fitted from all points
+and frames at once:
 
     L d^2 / C = albedo c (1 + retro (1 - c)^5)^2  +  f0 gloss(c)
     gloss(c) = alpha^2 c / (4 (c (1 - k) + k)^2 (c^2 (alpha^2 - 1) + 1)^2),    k = alpha / 2 (Schlick's G)
 
-L is the radiance that a light of colour C adds from a distance d, in units in which a white Lambertian surface facing
-it has L d^2 / C = 1: the pi of irradiance and the 1/pi of the BRDF have cancelled. `Reflectance.response` is the same
-model for any directions of light and view.
+L is the radiance that a light of colour C adds from a distance d, in units in which a white Lambertian
+surface facing it has L d^2 / C = 1: the pi of irradiance and the 1/pi of the BRDF have cancelled.
+`Reflectance.response` is the same model for any directions of light and view.
 """
 
 from __future__ import annotations
@@ -49,7 +50,7 @@ class Reflectance:
         return c * (1.0 + self.retro * (1.0 - c) ** 5) ** 2
 
     def gloss(self, cosine: torch.Tensor) -> torch.Tensor:
-        """What is added, f0 * gloss(c); 0 for c <= 0."""
+        """What the gloss adds to the diffuse part; 0 for c <= 0."""
         return self.f0 * gloss_lobe(cosine, self.alpha)
 
     def response(
@@ -57,8 +58,9 @@ class Reflectance:
     ) -> torch.Tensor:
         """Radiance under a light of unit colour at unit distance, for any directions.
 
-        For to_view = to_light it is `albedo * diffuse(c) + gloss(c)`. Away from there Burley's retro-reflection fades
-        with the angle between light and view, and gloss is GGX with Schlick's Fresnel term.
+        For to_view = to_light it is `albedo * diffuse(c) + gloss(c)`. Away from there Burley's
+        retro-reflection fades with the angle between light and view, and gloss is GGX with Schlick's
+        Fresnel term.
 
         Args:
             albedo: [..., 3].

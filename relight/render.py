@@ -3,16 +3,17 @@
     NAME.albedo.exr  NAME.normal.exr (world, unit)  NAME.shading.exr  NAME.mask.exr (0..1)  NAME.depth.exr
     NAME.<light>.exr  linear, not premultiplied      NAME.<light>.png  for looking, on black
 
-NAME is the name of the camera, the stem of its file. Pictures under the captured light, the room or the flash are
-shown at the camera's own exposure. What a new light is worth in these units is anybody's choice, so its PNGs are
-exposed such that the brightest half percent of the first view reaches `EXPOSED_TO`, the same for all views.
+NAME is the name of the camera, the stem of its file. Pictures under the captured light, the room or the
+flash are shown at the camera's own exposure. What a new light is worth in these units is anybody's choice,
+so its PNGs are exposed such that the brightest half percent of the first view reaches `EXPOSED_TO`, the
+same for all views.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -37,7 +38,8 @@ _CAPTURED = (CapturedLight, RoomLight, FlashLight)
 
 
 class PortraitRenderer:
-    """Renders one portrait; what does not depend on the view, such as depth maps from lights, is made once."""
+    """Renders one portrait; what does not depend on the view, such as depth maps from lights, is made
+    once."""
 
     def __init__(self, portrait: Portrait, *, shadows: bool = True) -> None:
         """A renderer; without `shadows` new lights pass through the subject."""

@@ -48,7 +48,8 @@ class Observation:
 
     Attributes:
         radiance: [H, W, 3] float32, linear, 1.0 = white clip.
-        valid: [H, W] float32, 1 where the pixel can be trusted, 0 where it is clipped, not finite or outside the lens.
+        valid: [H, W] float32, 1 where the pixel can be trusted, 0 where it is clipped, not finite or
+            outside the lens.
         mask: [H, W] float32 0..1 coverage of the subject, None = not given.
     """
 
@@ -64,7 +65,8 @@ class Scene:
         points: [P, 3] float32, world.
         normals_world: [P, 3] unit as the cloud brings them, or None.
         views: The frames to fit.
-        flash_offset_cam_m: [3] lens to flash in camera axes; zero when unknown (the paper's co-located flash).
+        flash_offset_cam_m: [3] lens to flash in camera axes; zero when unknown (the paper's co-located
+            flash).
         device: Where the solve runs.
     """
 
@@ -93,7 +95,7 @@ class Scene:
         """Reads, linearises and undistorts a frame and its mask."""
         record = self._records[view.index]
         radiance = self._session.load_radiance(record)
-        finite = np.isfinite(radiance).all(axis=-1)
+        finite: NDArray[np.bool_] = np.asarray(np.isfinite(radiance).all(axis=-1))
         if not finite.all():
             radiance = np.where(finite[..., None], radiance, np.float32(0.0))
         limit = np.inf if str(record.file).endswith(_FLOAT_SUFFIXES) else CLIPPED_RADIANCE
@@ -102,8 +104,8 @@ class Scene:
         mask = None if coverage is None else coverage.astype(np.float32) / np.float32(255.0)
         if view.index in self._distorted:
             grid = _undistortion_grid(self._distorted[view.index], view.camera)
-            radiance, valid = (cv2.remap(image, *grid, cv2.INTER_LINEAR) for image in (radiance, valid))
-            mask = None if mask is None else cv2.remap(mask, *grid, cv2.INTER_LINEAR)
+            radiance, valid = _remapped(radiance, grid), _remapped(valid, grid)
+            mask = None if mask is None else _remapped(mask, grid)
         return Observation(
             torch.from_numpy(radiance).to(self.device),
             torch.from_numpy(valid).to(self.device),
@@ -169,7 +171,7 @@ def _undistortion_grid(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """For cv2.remap: where each pixel of the straight picture lies in the distorted one, integer centres."""
     to_integer_centres = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1]])
-    return cv2.initUndistortRectifyMap(
+    x, y = cv2.initUndistortRectifyMap(
         to_integer_centres @ distorted.K,
         distorted.distortion,
         np.eye(3),
@@ -177,3 +179,11 @@ def _undistortion_grid(
         (straight.width, straight.height),
         cv2.CV_32FC1,
     )
+    return np.asarray(x, np.float32), np.asarray(y, np.float32)
+
+
+def _remapped(
+    image: NDArray[np.float32], grid: tuple[NDArray[np.float32], NDArray[np.float32]]
+) -> NDArray[np.float32]:
+    """The image read at the grid's places; 0, that is invalid, outside of it."""
+    return np.asarray(cv2.remap(image, *grid, cv2.INTER_LINEAR), np.float32)

@@ -1,17 +1,19 @@
 """Shadows that the subject casts on itself under a new light: the paper's second limitation removed.
 
-A depth map of the portrait's points from the light, and the question whether a pixel lies behind it (Williams 1978,
-"Casting curved shadows on curved surfaces"). Cells are as wide as a few points, cells without a point take the nearest
-of their neighbours, and the tolerance grows with the slant of the surface, so that no light leaks between points and no
-surface shades itself; the answer is interpolated between four cells (Reeves et al. 1987).
+A depth map of the portrait's points from the light, and the question whether a pixel lies behind it
+(Williams 1978, "Casting curved shadows on curved surfaces"). Cells are as wide as a few points, cells
+without a point take the nearest of their neighbours, and the tolerance grows with the slant of the surface,
+so that no light leaks between points and no surface shades itself; the answer is interpolated between four
+cells (Reeves et al. 1987).
 
-For a panorama, which is many distant lights, the question is answered once for every point of the portrait and looked
-up in every view.
+For a panorama, which is many distant lights, the question is answered once for every point of the portrait
+and looked up in every view.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -64,7 +66,7 @@ class ShadowCaster:
             )
         return self._seen[key]
 
-    def _cached(self, kind: str, vector: torch.Tensor, make) -> _DepthMap:  # type: ignore[no-untyped-def]
+    def _cached(self, kind: str, vector: torch.Tensor, make: Callable[[], _DepthMap]) -> _DepthMap:
         key = (kind, tuple(float(value) for value in vector))
         if key not in self._maps:
             self._maps[key] = make()
@@ -188,8 +190,8 @@ def _coordinates(
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Grid coordinates [P, 2], depth [P] and unit directions to the light [P, 3] or [1, 3].
 
-    The grid of a distant light is the plane across its rays; that of a point light is azimuthal equidistant about the
-    axis, in radians, which has no edge at any angle short of straight behind the light.
+    The grid of a distant light is the plane across its rays; that of a point light is azimuthal equidistant
+    about the axis, in radians, which has no edge at any angle short of straight behind the light.
     """
     if position is None:
         local = points @ axes.T

@@ -22,8 +22,8 @@ MIN_DISTANCE_M = 1e-3
 class SurfaceMaps(Protocol):
     """What can be shaded: maps of a view, [...] = [H, W], or arrays of points, [...] = [P].
 
-    Maps may also have a `room_radiance` [..., 3], linear: what the room's light makes of the surface, in colour. It
-    then takes the place of albedo * C_room * shading.
+    Maps may also have a `room_radiance` [..., 3], linear: what the room's light makes of the surface, in
+    colour. It then takes the place of albedo * C_room * shading.
     """
 
     @property
@@ -153,7 +153,8 @@ def cosine_falloff(points: Tensor, normals: Tensor, position: Tensor) -> Tensor:
 
 
 def direction_to(points: Tensor, position: Tensor) -> tuple[Tensor, Tensor]:
-    """Unit directions [..., 3] from points [..., 3] to a position [3], and distances [..., 1]; 0 at the point."""
+    """Unit directions [..., 3] from points [..., 3] to a position [3], and distances [..., 1]; 0 at the
+    point."""
     towards = position - points
     distance = torch.linalg.vector_norm(towards, dim=-1, keepdim=True)
     return towards / distance.clamp(min=1e-12), distance
