@@ -23,8 +23,8 @@ import cv2
 import numpy as np
 
 from capture.cameras import Camera
-from capture.ply import PointCloud, read_ply
 from capture.frame_record import EXCLUDING_REASONS, FrameRecord
+from capture.ply import PointCloud, read_ply
 from capture.session import Session
 from relight.errors import PlanError
 from relight.view_redundancy import redundant_views
@@ -32,14 +32,17 @@ from relight.view_redundancy import redundant_views
 FORCEABLE = ("undistortion", "redundant_views", "room_shading")
 """Decisions that `--force NAME=run|skip` may turn round."""
 
-FEWEST_FLASH_VIEWS = 3
-"""Three light directions are what an albedo and a normal need at least (Woodham 1980)."""
+NORMAL_FLASH_VIEWS = 3
+"""Three light directions are what a normal needs at least (Woodham 1980); an albedo needs one."""
 
 DARK_ROOM = 0.01
 """Room light below this share of the flash-lit radiance is under the quantisation of an 8-bit frame."""
 
 STRAIGHT_PX = 0.1
 """Distortion that moves no pixel further than this is below what poses and points are known to."""
+
+DARK_FRAMES = 12
+"""Unlit frames that a dark room is still seen in: every part of the head is in several of them."""
 
 _SAMPLED_FRAMES = 5  # of each kind, for the dark-room test: their mean is known to well under DARK_ROOM
 _SECONDS_PER_POINT_AND_FRAME = 0.9e-6  # photometric solve on two cores, see docs/results.md
@@ -163,6 +166,9 @@ def make_plan(session: Session, forced: Mapping[str, Action] | None = None) -> P
     if views.action is Action.SKIP:
         left_out |= {index: f"same view as frame {twin}" for index, twin in redundant.items()}
         fitted = [record for record in fitted if record.index not in redundant]
+    room, spare = _room_shading(session, fitted, forced)
+    left_out |= {record.index: "dark" for record in spare}
+    fitted = [record for record in fitted if record not in spare]
 
     decisions = (
         _frames(session.frames, fitted, left_out),
@@ -173,7 +179,7 @@ def make_plan(session: Session, forced: Mapping[str, Action] | None = None) -> P
         _cloud(cloud),
         _normals(cloud),
         _masks(session, fitted),
-        _room_shading(session, fitted, forced),
+        room,
     )
     return Plan(
         decisions,
@@ -228,13 +234,10 @@ def _flash(frames: list[FrameRecord], fitted: list[FrameRecord]) -> Decision:
             Action.REFUSE,
             f"all {lit} frames are lit by the flash; frames without it are needed to tell the room apart",
         )
-    if lit < FEWEST_FLASH_VIEWS:
-        return Decision(
-            "flash",
-            Action.REFUSE,
-            f"only {lit} flash frames can be fitted and a normal needs {FEWEST_FLASH_VIEWS}; film for longer",
-        )
-    return Decision("flash", Action.GIVEN, f"{lit} lit and {unlit} unlit frames by their tags")
+    seen = f"{lit} lit and {unlit} unlit frames by their tags"
+    if lit < NORMAL_FLASH_VIEWS:
+        seen += f"; under {NORMAL_FLASH_VIEWS} lit ones leave the normals as the cloud has them"
+    return Decision("flash", Action.GIVEN, seen)
 
 
 def _poses(frames: list[FrameRecord], poses: Mapping[int, Camera]) -> Decision:
@@ -289,39 +292,50 @@ def _cloud(cloud: PointCloud | None) -> Decision:
 
 
 def _normals(cloud: PointCloud | None) -> Decision:
+    seen = "from each point's neighbours, refined by the flash"
     if cloud is not None and cloud.normals is not None:
-        return Decision(
-            "normals", Action.GIVEN, "the cloud has normals; the flash refines them", "a neighbour search"
-        )
-    return Decision("normals", Action.RUN, "from each point's neighbours, then refined by the flash")
+        seen += "; the cloud's own say which side is out"
+    return Decision("normals", Action.RUN, seen)
 
 
 def _masks(session: Session, fitted: list[FrameRecord]) -> Decision:
     masked = sum(session.mask_path(record.index).is_file() for record in fitted)
     if masked:
-        return Decision("masks", Action.GIVEN, f"masks of {masked} of {len(fitted)} frames", "segmentation")
-    return Decision(
-        "masks", Action.RUN, "none given: the flash tells the head, which it lights, from the room behind"
-    )
+        seen = f"masks of {masked} of {len(fitted)} frames clean the cloud"
+        return Decision("masks", Action.GIVEN, seen, "segmentation")
+    return Decision("masks", Action.SKIP, "none given: every point of the cloud is taken for the head")
 
 
-def _room_shading(session: Session, fitted: list[FrameRecord], forced: Mapping[str, Action]) -> Decision:
+def _room_shading(
+    session: Session, fitted: list[FrameRecord], forced: Mapping[str, Action]
+) -> tuple[Decision, list[FrameRecord]]:
+    """Whether there is a room to solve for, and the unlit frames that are not needed where there is none."""
     name = "room_shading"
     lit = [record for record in fitted if record.flash == 1]
     unlit = [record for record in fitted if record.flash == 0]
     if not lit or not unlit:
-        return Decision(name, Action.RUN, "cannot be told without both kinds of frames")
+        return Decision(name, Action.RUN, "cannot be told without both kinds of frames"), []
     share = _mean_radiance(session, unlit) / max(_mean_radiance(session, lit), 1e-9)
     seen = f"the room gives {100 * share:.2g} % of the radiance of flash frames"
     action = Action.RUN if share > DARK_ROOM else Action.SKIP
-    if name in forced and forced[name] is not action:
-        return Decision(name, forced[name], f"{seen}, forced", forced=True)
-    return Decision(name, action, seen, "the room's term of the solve" if action is Action.SKIP else "")
+    wanted = forced.get(name, action)
+    if wanted is Action.RUN:
+        return Decision(name, wanted, seen, forced=wanted is not action), []
+    kept = {record.index for record in _evenly(unlit, max(DARK_FRAMES, len(lit)))}
+    spare = [record for record in unlit if record.index not in kept]
+    saving = f"{len(spare)} unlit frames that would show the dark again" if spare else ""
+    return Decision(name, wanted, seen, saving, forced=wanted is not action), spare
 
 
 def _mean_radiance(session: Session, records: list[FrameRecord]) -> float:
-    picks = np.linspace(0, len(records) - 1, min(_SAMPLED_FRAMES, len(records))).round().astype(int)
-    return float(np.mean([session.load_radiance(records[pick])[::8, ::8].mean() for pick in picks]))
+    sample = _evenly(records, _SAMPLED_FRAMES)
+    return float(np.mean([session.load_radiance(record)[::8, ::8].mean() for record in sample]))
+
+
+def _evenly(records: list[FrameRecord], count: int) -> list[FrameRecord]:
+    """At most `count` of the records, spread over all of them."""
+    picks = np.linspace(0, len(records) - 1, min(count, len(records))).round().astype(int)
+    return [records[pick] for pick in picks]
 
 
 def _distortion_px(camera: Camera) -> float:

@@ -41,10 +41,10 @@ class Stages:
 
 
 def peak_memory_mb() -> float | None:
-    """Most resident memory of this process so far, 10^6 bytes; None where the system does not say (Windows)."""
+    """Most resident memory of this process so far, 10^6 bytes; None where the system does not say."""
     try:
         import resource
-    except ImportError:
+    except ImportError:  # Windows
         return None
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak / 1e6 if sys.platform == "darwin" else peak * 1024 / 1e6

@@ -67,9 +67,14 @@ def test_without_a_terminal_each_stage_is_a_line(capsys):
 
 def test_a_stage_that_fails_is_not_called_done():
     stream = io.StringIO()
-    with pytest.raises(KeyError), StageProgress(stream) as progress:
-        progress("solve", 0.3)
-        raise KeyError
+
+    def work():
+        with StageProgress(stream) as progress:
+            progress("solve", 0.3)
+            raise KeyError
+
+    with pytest.raises(KeyError):
+        work()
     assert stream.getvalue().startswith("solve: stopped after")
 
 

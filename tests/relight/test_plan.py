@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from capture.cameras import Camera
+from capture.frame_record import FrameRecord
 from capture.images import write_png
 from capture.ply import PointCloud, write_ply
-from capture.frame_record import FrameRecord
 from capture.session import Session
 from relight.errors import PlanError
-from relight.plan import Action, make_plan, parse_forced
+from relight.plan import DARK_FRAMES, Action, make_plan, parse_forced
 from relight.view_redundancy import ENOUGH_REPEATS
 
 WIDTH, HEIGHT = 64, 48
@@ -96,7 +96,7 @@ def test_a_session_with_poses_and_a_cloud_can_be_fitted(tmp_path):
         "undistortion": Action.SKIP,
         "cloud": Action.GIVEN,
         "normals": Action.RUN,
-        "masks": Action.RUN,
+        "masks": Action.SKIP,
         "room_shading": Action.RUN,
     }
     assert plan.frames == tuple(range(16))
@@ -106,7 +106,7 @@ def test_a_session_with_poses_and_a_cloud_can_be_fitted(tmp_path):
 
 def test_what_the_scene_brings_is_taken(tmp_path):
     plan = make_plan(make_session(tmp_path / "s", normals=True, masks=True))
-    assert plan.decision("normals").action is Action.GIVEN
+    assert "which side is out" in plan.decision("normals").reason
     assert plan.decision("masks").action is Action.GIVEN
     assert "16 of 16" in plan.decision("masks").reason
 
@@ -118,7 +118,6 @@ def test_what_the_scene_brings_is_taken(tmp_path):
         ({"cloud": False}, "cloud", "--points"),
         ({"flags": (0,) * 8}, "flash", "no frame is fully lit"),
         ({"flags": (1,) * 8}, "flash", "all 8 frames are lit"),
-        ({"flags": (1, 0, 0, 1)}, "flash", "only 2 flash frames"),
     ],
 )
 def test_a_session_that_cannot_be_fitted_is_refused_with_what_to_add(tmp_path, options, name, word):
@@ -126,6 +125,11 @@ def test_a_session_that_cannot_be_fitted_is_refused_with_what_to_add(tmp_path, o
     assert plan.decision(name).action is Action.REFUSE
     with pytest.raises(PlanError, match=word):
         plan.check()
+
+
+def test_few_flash_frames_are_said_to_leave_the_normals(tmp_path):
+    assert "normals" in make_plan(make_session(tmp_path / "two", (1, 0, 0, 1))).decision("flash").reason
+    assert "normals" not in make_plan(make_session(tmp_path / "three", (1, 0, 1, 1))).decision("flash").reason
 
 
 def test_frames_that_cannot_be_used_are_left_out_and_say_why(tmp_path):
@@ -149,8 +153,11 @@ def test_a_frame_without_a_pose_is_left_out(tmp_path):
 
 
 def test_a_dark_room_needs_no_shading_and_a_lit_one_does(tmp_path):
-    dark = make_plan(make_session(tmp_path / "dark", room=0.0))
+    flags = (1, 0, 0, 0) * 5
+    dark = make_plan(make_session(tmp_path / "dark", flags, room=0.0))
     assert dark.decision("room_shading").action is Action.SKIP
+    # 15 unlit frames, of which as many stay as a dark room needs.
+    assert list(dark.left_out.values()) == ["dark"] * (15 - DARK_FRAMES)
     # 3 levels of 255 in a lit frame of 0.5: 2.3 %, above the 1 % of DARK_ROOM.
     dim = make_plan(make_session(tmp_path / "dim", room=3 / 255))
     assert dim.decision("room_shading").action is Action.RUN

@@ -1,0 +1,43 @@
+"""What is in a session, in a few lines for a person."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+
+from capture.frame_record import EXCLUDING_REASONS
+from capture.session import Session
+
+
+def describe_session(session: Session) -> str:
+    """Frames by what they are good for, what else the session has, and what to do next."""
+    frames = session.frames
+    usable = [record for record in frames if record.usable]
+    lit = sum(record.flash == 1 for record in usable)
+    excluded = Counter(
+        next((reason for reason in record.reasons if reason in EXCLUDING_REASONS), "flash_unknown")
+        for record in frames
+        if not record.usable
+    )
+    image = session.info["image"]
+    size = f"{image['width']} x {image['height']} pixels, {image['transfer']}"
+    lines = [
+        f"session   {session.path}",
+        f"frames    {len(frames)} looked at, {size}",
+        f"usable    {len(usable)}: {lit} lit, {len(usable) - lit} unlit",
+    ]
+    if excluded:
+        counts = ", ".join(f"{count} {reason.replace('_', ' ')}" for reason, count in excluded.most_common())
+        lines.append(f"not used  {counts}")
+    lines += [
+        f"poses     {_word(session.cameras_dir)}",
+        f"cloud     {_word(session.points_path)}",
+        f"masks     {_word(session.masks_dir)}",
+        *(f"note      {sentence}" for sentence in session.repairs),
+        f"next      relight plan {session.path}",
+    ]
+    return "\n".join(lines)
+
+
+def _word(path: Path) -> str:
+    return "yes" if path.exists() else "no"
