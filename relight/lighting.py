@@ -291,26 +291,13 @@ class EnvironmentLight(Light):
         else:
             irradiance = self._irradiance(normals)
             if self.shadows:
-                irradiance = irradiance * self._unshadowed_share(surface, world_from_panorama)
+                # A share of few lights times the exact integral: without any shadow it is exactly one, so few
+                # cost no accuracy there (Heitz 2018, "Combining analytic direct illumination and stochastic
+                # shadows").
+                directions, irradiances = (surface.vector(part) for part in self._lights)
+                directions = directions @ world_from_panorama.T
+                irradiance = irradiance * surface.environment_share(directions, irradiances)
         return surface.albedo * (self.gain / math.pi) * irradiance
-
-    def _unshadowed_share(self, surface: Surface, world_from_panorama: Tensor) -> Tensor | float:
-        """Share of the irradiance that is not in shadow, [P, 3] in 0..1.
-
-        A ratio of sums over a few lights, with and without their visibility, that multiplies the exact
-        integral: without any shadow it is exactly one, so few lights cost no accuracy there (Heitz 2018,
-        "Combining analytic direct illumination and stochastic shadows").
-        """
-        directions, irradiances = (surface.vector(part) for part in self._lights)
-        directions = directions @ world_from_panorama.T
-        visible = surface.sees_directions(directions)
-        if visible is None:
-            return 1.0
-        cosines = cosine(directions, surface.normals.T)  # [K, P]
-        everything = cosines.T @ irradiances
-        seen = (cosines * visible).T @ irradiances
-        dark = everything <= 0.0
-        return torch.where(dark, 1.0, seen / torch.where(dark, 1.0, everything))
 
     @cached_property
     def _irradiance(self) -> DiffuseIrradiance:

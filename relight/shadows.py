@@ -29,6 +29,7 @@ _STEEPEST = (
     20.0  # tangent: surfaces that the light grazes at more than 87 degrees are dark by their cosine anyway
 )
 _LARGEST_SIDE = 4096  # cells
+_MUTUAL = 0.25  # hollows face parts that are themselves turned away or in shadow
 
 
 class ShadowCaster:
@@ -38,7 +39,7 @@ class ShadowCaster:
         """A caster for a portrait."""
         self.portrait = portrait
         self._maps: dict[tuple[str, tuple[float, ...]], _DepthMap] = {}
-        self._seen: dict[bytes, torch.Tensor] = {}
+        self._shares: dict[bytes, torch.Tensor] = {}
 
     def of_view(self, maps: Maps) -> ViewVisibility:
         """The visibility of lights from the pixels of a view."""
@@ -52,19 +53,36 @@ class ShadowCaster:
         """Depth map from a distant light in a direction [3]."""
         return self._cached("distant", to_light, lambda: _from_afar(self.portrait, to_light, _CELL))
 
-    def points_seen_from(self, directions: torch.Tensor) -> torch.Tensor:
-        """Which of the points [P] each of the distant lights [K, 3] reaches: [K, P] bool."""
-        key = directions.detach().cpu().numpy().tobytes()
-        if key not in self._seen:
-            points, normals = self.portrait.points, self.portrait.normals_world
-            rows = [
-                (_from_afar(self.portrait, to_light, _CELL_MANY).visible(points, normals, soft=False) > 0.5)
-                for to_light in directions.to(points)
-            ]
-            self._seen[key] = (
-                torch.stack(rows) if rows else points.new_zeros((0, len(points)), dtype=torch.bool)
-            )
-        return self._seen[key]
+    def environment(self, directions: torch.Tensor, irradiances: torch.Tensor) -> torch.Tensor:
+        """Share [P, C] of the irradiance of many distant lights that reaches each of the points.
+
+        Light that comes from the subject itself is part of it: from the directions in which a point sees no
+        sky it sees other parts of the subject, taken for of its own albedo and under a share `_MUTUAL` of the
+        mean irradiance. That keeps eye sockets from going black.
+
+        Args:
+            directions: [K, 3], unit, where the light comes from.
+            irradiances: [K, C], at normal incidence.
+        """
+        key = directions.detach().cpu().numpy().tobytes() + irradiances.detach().cpu().numpy().tobytes()
+        if key not in self._shares:
+            portrait = self.portrait
+            unshadowed = portrait.points.new_zeros(len(portrait.points), irradiances.shape[1])
+            arriving = torch.zeros_like(unshadowed)
+            for to_light, irradiance in zip(
+                directions.to(unshadowed), irradiances.to(unshadowed), strict=True
+            ):
+                cosine = (portrait.normals_world @ to_light).clamp(min=0.0)
+                depth_map = _from_afar(portrait, to_light, _CELL_MANY)
+                lit = cosine * depth_map.visible(portrait.points, portrait.normals_world, soft=False)
+                unshadowed += cosine[:, None] * irradiance
+                arriving += lit[:, None] * irradiance
+            open_sky = arriving.sum(dim=1) / unshadowed.sum(dim=1).clamp(min=1e-12)
+            mutual = _MUTUAL * (1.0 - open_sky) * portrait.albedo.mean(dim=1)
+            arriving += mutual[:, None] * unshadowed.mean(dim=0)
+            dark = unshadowed <= 0
+            self._shares[key] = torch.where(dark, 1.0, arriving / torch.where(dark, 1.0, unshadowed))
+        return self._shares[key]
 
     def _cached(self, kind: str, vector: torch.Tensor, make: Callable[[], _DepthMap]) -> _DepthMap:
         key = (kind, tuple(float(value) for value in vector))
@@ -89,14 +107,14 @@ class ViewVisibility:
         """[H, W] 0..1 for a distant light, unit direction [3]."""
         return self._of_pixels(self._caster.directional(to_light))
 
-    def environment(self, directions: torch.Tensor) -> torch.Tensor:
-        """[K, H, W] 0 or 1 for distant lights [K, 3]; 1 off the subject."""
-        seen = self._caster.points_seen_from(directions)
+    def environment(self, directions: torch.Tensor, irradiances: torch.Tensor) -> torch.Tensor:
+        """[H, W, C] share of the irradiance [K, C] of distant lights [K, 3]; 1 off the subject."""
+        share = self._caster.environment(directions, irradiances)
         ids = self._maps.point_ids
         on = ids >= 0
-        visible = torch.ones((len(directions), *ids.shape), dtype=torch.bool, device=ids.device)
-        visible[:, on] = seen[:, ids[on]]
-        return visible
+        result = share.new_ones(*ids.shape, share.shape[1])
+        result[on] = share[ids[on]]
+        return result
 
     def _of_pixels(self, depth_map: _DepthMap) -> torch.Tensor:
         on = self._maps.mask > 0

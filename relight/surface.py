@@ -56,8 +56,11 @@ class Visibility(Protocol):
     def directional(self, to_light: Tensor) -> Tensor:
         """[...] for a distant light, unit direction [3]."""
 
-    def environment(self, directions: Tensor) -> Tensor | None:
-        """[K, ...] for distant lights, unit directions [K, 3]; None where that is not offered."""
+    def environment(self, directions: Tensor, irradiances: Tensor) -> Tensor | None:
+        """[..., C], of all that K distant lights would give without shadows.
+
+        Unit directions [K, 3] and irradiances at normal incidence [K, C]; None where that is not offered.
+        """
 
 
 class Surface:
@@ -113,10 +116,12 @@ class Surface:
             return 1.0
         return self._gather_visible(self._visibility.directional(to_light)[None])[0]
 
-    def sees_directions(self, directions: Tensor) -> Tensor | None:
-        """[K, P], how much of each distant light is seen; None without a visibility that offers it."""
-        visible = None if self._visibility is None else self._visibility.environment(directions)
-        return None if visible is None else self._gather_visible(visible)
+    def environment_share(self, directions: Tensor, irradiances: Tensor) -> Tensor | float:
+        """[P, C], share of the irradiance of distant lights that arrives; 1 where that is not offered."""
+        if self._visibility is None:
+            return 1.0
+        share = self._visibility.environment(directions, irradiances)
+        return 1.0 if share is None else self._gather(share.to(self._maps.albedo))
 
     def scatter(self, values: Tensor) -> Tensor:
         """Values [P, C] of the points back in the maps' shape, [..., C], 0 elsewhere."""

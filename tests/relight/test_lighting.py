@@ -120,9 +120,10 @@ class HalfVisible:
         self.asked.append(to_light)
         return self.half
 
-    def environment(self, directions):
+    def environment(self, directions, irradiances):
         self.asked.append(directions)
-        return self.half.expand(len(directions), *self.half.shape) if self.has_environment else None
+        channels = irradiances.shape[1]
+        return self.half[..., None].expand(*self.half.shape, channels) if self.has_environment else None
 
 
 def panorama():
@@ -290,8 +291,9 @@ def test_shadow_of_one_side_leaves_the_light_of_the_other():
     image[7:9, 7:9] = (0.0, 1.0, 0.0)  # green from +X
 
     class LeftHidden(HalfVisible):
-        def environment(self, directions):
-            return (directions[:, :1] < 0).to(torch.float64)
+        def environment(self, directions, irradiances):
+            left = irradiances * (directions[:, :1] < 0)
+            return (left.sum(dim=0) / irradiances.sum(dim=0).clamp(min=1e-12))[None]
 
     maps, light = one_point((0.0, 0.0, 1.0)), EnvironmentLight(image)
     open_, hidden = shade(light, maps), shade(light, maps, visibility=LeftHidden((1,)))
