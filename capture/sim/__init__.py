@@ -1,35 +1,24 @@
 """The simulated rig: a person in a room, filmed by a phone whose flash blinks, with the truth beside it.
 
 It is the embedded default, for trying everything without hardware and for tests with a known answer. It has
-its own
-geometry, its own light transport and its own rasteriser (OpenCV's), so that the fit is never tested on
-itself.
+its own geometry, its own light transport and its own rasteriser (OpenCV's), so that the fit is never tested
+on itself.
 
 Modelled: a sculpted head with eyes, lips, ears, eyebrows, strands of hair with a soft outline, skin with
-    freckles,
-pores and redness, a shirt; several subjects by seed, bald and glossy-skinned ones too. Diffuse and glossy
-reflection
-of a furnished room (with the sitter's own broad shadows), of an off-axis flash (1/d^2, cosine, cast shadows,
-gloss)
-and of novel lights. A hand-held path with sway and tremor. A lamp with a timer of fixed delay, rise, fall
-and droop. A
-rolling shutter that catches pulses in part of the rows. Shot and read noise, black level, conversion,
-clipping,
-transfer curve; on request lost frames, drift of exposure and white balance, mains flicker, missed pulses;
-H.264 or HEVC
-with a phone's colour tags and rotation.
+freckles, pores and redness, a shirt; several subjects by seed, bald and glossy-skinned ones too. Diffuse and
+glossy reflection of a furnished room (with the sitter's own broad shadows), of an off-axis flash (1/d^2,
+cosine, cast shadows, gloss) and of novel lights. A hand-held path with sway and tremor. A lamp with a timer
+of fixed delay, rise, fall and droop. A rolling shutter that catches pulses in part of the rows. Shot and
+read noise, black level, conversion, clipping, transfer curve; on request lost frames, drift of exposure and
+white balance, mains flicker, missed pulses; H.264 or HEVC with a phone's colour tags and rotation.
 
 Not modelled: light that bounces between parts of the sitter or goes through skin; the sitter's motion; a
-shadow of the
-sitter on the room's walls; motion blur, and the bending of moving edges by the rolling shutter (each frame
-has one pose);
-lens distortion, vignetting, flare, focus hunting; sharpening and noise reduction of the phone; sound. The
-room's light
-is taken as distant: the same over the whole head but for shadows.
+shadow of the sitter on the room's walls; motion blur, and the bending of moving edges by the rolling shutter
+(each frame has one pose); lens distortion, vignetting, flare, focus hunting; sharpening and noise reduction
+of the phone; sound. The room's light is taken as distant: the same over the whole head but for shadows.
 
 Modules in the order in which a photon meets them: lamp and room, bust (head, eyes, skin, hair), shading,
-camera_path,
-sensor, rig, truth; `simulate` writes the folders.
+camera_path, sensor, rig, truth; `simulate` writes the folders.
 """
 
 from capture.sim.config import RigConfig

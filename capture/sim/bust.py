@@ -59,7 +59,7 @@ class Bust:
         return self.triangles[self.triangles[:, 0] >= self.strand_start]
 
 
-def build_bust(subject: Subject, cell_mm: float = 2.2, subdivisions: int = 1, strands: int = 9000) -> Bust:
+def build_bust(subject: Subject, cell_mm: float = 2.4, subdivisions: int = 1, strands: int = 8500) -> Bust:
     """Sculpt, mesh, paint and comb a subject.
 
     Args:
@@ -87,7 +87,7 @@ def build_bust(subject: Subject, cell_mm: float = 2.2, subdivisions: int = 1, st
     normals = fine.normals()
 
     albedo, gloss = paint_skin(fine.vertices, head)
-    streaks = 1.0 + 0.35 * value_noise(hair._across(fine.vertices), 1.4, subject.seed + 90)
+    streaks = 1.0 + 0.35 * value_noise(hair.across(fine.vertices), 1.4, subject.seed + 90)
     albedo[combed] = (np.array(subject.hair) * 0.6 * streaks[:, None])[combed]
     gloss[combed] = 0.012
     eyes = make_eyes(head)

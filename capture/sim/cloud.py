@@ -54,8 +54,7 @@ def stereo_cloud(bust: Bust, cameras: list[Camera], count: int, rng: np.random.G
     """Points as dense stereo finds them: what cameras see, with noise, bumps, holes and outliers.
 
     Noise of 0.5 mm along the ray of the camera that sees a point best, more at grazing angles; bumps of 0.4
-    mm; about
-    2 % of the points missing in holes and 1 % of outliers. No normals, no colours.
+    mm; about 2 % of the points missing in holes and 1 % of outliers. No normals, no colours.
     """
     exact = sample_surface(bust, round(count * 1.5), rng)
     assert exact.normals is not None

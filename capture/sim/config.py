@@ -60,9 +60,9 @@ class RigConfig:
     flash_every: int = 5
     validation_views: int = 10
     cloud_points: int = 120_000
-    cell_mm: float = 2.2
+    cell_mm: float = 2.4
     subdivisions: int = 1
-    strands: int = 9000
+    strands: int = 8500
     shadow_directions: int = 128
     supersampling: int = 2
     codec: str = "h264"

@@ -1,12 +1,12 @@
 """Hair: a combed volume that hides the scalp, and thousands of ribbons that soften its outline.
 
 Points are in head millimetres. A ribbon is two triangles a segment, wide across the strand and rolled at
-random, so
-that the silhouette thins out instead of ending; eyebrows are the same ribbons, short.
+random, so that the silhouette thins out instead of ending; eyebrows are the same ribbons, short.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,6 +23,9 @@ _LINE_Y = np.array([-80.0, -76.0, -50.0, -32.0, -26.0, -18.0, 26.0, 54.0, 63.0, 
 # style: thickness at the sides and at the top (mm), strand length (mm)
 _STYLES = {"short": (5.0, 12.0, 20.0), "swept": (7.0, 21.0, 55.0), "bob": (9.0, 13.0, 95.0)}
 _PART_X = 24.0
+
+# (points, unit normals) to unit tangents, all [P, 3]
+Flow = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -80,12 +83,13 @@ class HairShape:
 
     def _clumps(self, p: np.ndarray) -> np.ndarray:
         """Relief [P] of locks, drawn out along the combing."""
-        across = self._across(p)
+        across = self.across(p)
         return 1.3 * value_noise(across, 7.0, self.head.subject.seed + 71) + 0.7 * value_noise(
             across, 2.6, self.head.subject.seed + 72
         )
 
-    def _across(self, p: np.ndarray) -> np.ndarray:
+    def across(self, p: np.ndarray) -> np.ndarray:
+        """Coordinates [P, 3] that change little along the combing: noise of them makes locks and streaks."""
         if self.style == "short":
             return p * np.float32(0.55)
         if self.style == "bob":
@@ -210,19 +214,18 @@ def _grow(
     lengths: np.ndarray,
     lift: np.ndarray,
     colour: np.ndarray,
-    flow: object,
+    flow: Flow,
     *,
     segments: int,
     width: float,
     rng: np.random.Generator,
 ) -> Strands:
     """Walk along `flow` over the surface, rising to `lift` mm above it, and put a ribbon on each path."""
-    assert callable(flow)
     tree = cKDTree(surface)
     count = len(roots)
     at = roots.astype(np.float32)
     step = (lengths / segments).astype(np.float32)[:, None]
-    points, ups, tangents = [], [], []
+    points, ups = [], []
     for k in range(segments + 1):
         _, nearest = tree.query(at)
         up = normals[nearest]
@@ -230,11 +233,9 @@ def _grow(
         away = ((at - surface[nearest]) * up).sum(axis=-1)
         reach = np.clip(height - away, -2.5, 1.2)[:, None]
         at = (at + reach * up).astype(np.float32)
-        along = np.asarray(flow(at, up), dtype=np.float32)
         points.append(at)
         ups.append(up)
-        tangents.append(along)
-        at = at + step * along
+        at = at + step * flow(at, up).astype(np.float32)
     path, up = np.stack(points, axis=1), np.stack(ups, axis=1)
     along = np.gradient(path, axis=1)
     along /= np.maximum(np.linalg.norm(along, axis=-1, keepdims=True), 1e-6)
@@ -248,8 +249,7 @@ def _grow(
     )
     taper = np.sqrt(1.0 - np.linspace(0.0, 0.97, segments + 1))[None, :, None]
     half = 0.5 * width * taper * rng.uniform(0.6, 1.3, (count, 1, 1))
-    # Both edges of a segment's end share the facing, bent towards its edge: the ribbon shades like a round
-    # lock.
+    # The facing bends towards each edge: the flat ribbon shades like a round lock.
     edges = np.stack([path - half * across, path + half * across], axis=2)
     shading = np.stack([facing - 0.5 * across, facing + 0.5 * across], axis=2)
     shading /= np.linalg.norm(shading, axis=-1, keepdims=True)

@@ -1,10 +1,9 @@
 """When the flash is on, and how much of it each row of a rolling-shutter frame catches.
 
 The lamp is switched as Open Camera's "flash while recording" does: a timer of fixed DELAY fires every period
-or a little
-later, the torch goes on, and off again after a sleep. Its light rises and falls in a few milliseconds and
-droops as the
-LED warms. Row r of H, of a frame that starts at s, exposes during [s + r/H * readout, the same + exposure].
+or a little later, the torch goes on, and off again after a sleep. Its light rises and falls in a few
+milliseconds and droops as the LED warms. Row r of H, of a frame that starts at s, exposes during [s + r/H *
+readout, the same + exposure].
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """From a signed distance to a triangle mesh: sparse surface nets, subdivision, projection, vertex normals.
 
 Surface nets: one vertex in each grid cell that the surface crosses (the mean of the crossings of its edges),
-one
-quad around each grid edge that it crosses. Only blocks near the surface are ever evaluated.
+one quad around each grid edge that it crosses. Only blocks near the surface are ever evaluated.
 Source: Gibson 1998, Constrained Elastic Surface Nets (without the relaxation: vertices are projected
     instead).
 """

@@ -1,8 +1,7 @@
 """Triangles to pixels: a thin layer over OpenCV's software rasteriser, in the rig's own conventions.
 
 World coordinates in metres, OpenCV camera axes, pixel (0, 0) covers [0, 1) x [0, 1): attributes and depth
-are those
-of the pixel's centre, interpolated with perspective. This is not the rasteriser that the fit uses.
+are those of the pixel's centre, interpolated with perspective. This is not the rasteriser that the fit uses.
 """
 
 from __future__ import annotations

@@ -1,10 +1,8 @@
 """The room behind the sitter: walls, furniture, pictures, a window and a lamp, with the light baked in.
 
 A room is a list of rectangles. Their textures lie in one atlas; the light that they receive from window and
-lamp is
-computed once on a coarse grid and multiplied in. What the sitter receives of the room is the panorama seen
-from the
-middle of the head.
+lamp is computed once on a coarse grid and multiplied in. What the sitter receives of the room is the
+panorama seen from the middle of the head.
 """
 
 from __future__ import annotations
@@ -30,7 +28,7 @@ def _received(panel: Panel, lights: list[Panel], rows: int, columns: int) -> np.
     points = panel.grid(rows, columns)
     total = np.zeros((rows, columns, 3))
     for light in lights:
-        samples, size = 5, light.texture.shape
+        samples = 5
         texture = cv2.resize(light.texture, (samples, samples), interpolation=cv2.INTER_AREA)
         area = np.linalg.norm(np.cross(light.u, light.v)) / samples**2
         offsets = (np.arange(samples) + 0.5) / samples
@@ -41,7 +39,6 @@ def _received(panel: Panel, lights: list[Panel], rows: int, columns: int) -> np.
                 square = np.maximum((ray**2).sum(-1), 0.02)
                 cosines = np.maximum(ray @ panel.normal, 0) * np.maximum(-(ray @ light.normal), 0) / square
                 total += (cosines * area / (np.pi * square))[..., None] * texture[i, j]
-        assert size[2] == 3
     return total
 
 

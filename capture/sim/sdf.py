@@ -1,8 +1,7 @@
 """Signed distances (negative inside) and their smooth unions: the clay that the head is sculpted from.
 
 All functions take points [P, 3] and return [P] in the unit of the points. An ellipsoid's distance is the
-usual
-first-order approximation; it is exact on the surface, which is all that the mesher needs.
+usual first-order approximation; it is exact on the surface, which is all that the mesher needs.
 """
 
 from __future__ import annotations

@@ -4,9 +4,8 @@
       + F * (C_flash / d^2) * max(0, <n, l>) * visible * (albedo + gloss lobe)
 
 Diffuse light is the fit's own model (Sevastopolsky et al. 2020, eqs. 1-7); gloss, cast shadows and their
-penumbrae are
-what the fit does not know. Vertices lie about one pixel apart, so interpolated vertex radiance is as sharp
-as the picture.
+penumbrae are what the fit does not know. Vertices lie about one pixel apart, so interpolated vertex radiance
+is as sharp as the picture.
 """
 
 from __future__ import annotations

@@ -82,10 +82,8 @@ def simulate_video(
     """Writes a phone's video `VID_yyyymmdd_hhmmss.mp4` of the rig, with poses, cloud and truth beside it.
 
     cameras.json has an entry with `pts_s` for each frame of the video (no file); truth.jsonl says for each
-    frame what the
-    lamp really did, truth.json the pulses and the resolved configuration. cameras_val.json are extra cameras
-    near the
-    path, noise-free, alternately without and with flash, with ground truth.
+    frame what the lamp really did, truth.json the pulses and the resolved configuration. cameras_val.json
+    are extra cameras near the path, noise-free, alternately without and with flash, with ground truth.
 
     Args:
         out: folder to write into; made when missing.

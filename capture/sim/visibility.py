@@ -1,8 +1,7 @@
 """Which light reaches which point of the sitter: depth maps seen from the light.
 
 Broad light (room, environments) is blocked per vertex, once: `BroadShadows` looks at the head from many
-directions.
-Small lights (flash, point) get one sharp depth map each time: `point_visibility`.
+directions. Small lights (flash, point) get one sharp depth map each time: `point_visibility`.
 """
 
 from __future__ import annotations
