@@ -25,7 +25,8 @@ from capture.session import Session
 from relight.devices import choose_device, describe_device
 from relight.errors import PlanError
 from relight.photometric import SolveConfig, solve
-from relight.plan import Action, Plan, make_plan
+from relight.plan import Action, Plan
+from relight.planning import make_plan
 from relight.portrait import Portrait
 from relight.previews import write_previews
 from relight.report import write_report
@@ -55,7 +56,7 @@ def fit(
         session: The session's folder.
         preset: One of `PRESETS`.
         device: "cpu" or "cuda"; by default the card where there is one.
-        max_seconds: Ends the refinement after this long; the portrait is then the best so far.
+        max_seconds: Time that the fit should end within; the plan leaves frames out until it does.
         name: What to call the portrait; its preset's name by default. One of that name is replaced.
         forced: Decisions of the plan to turn round.
         progress: Told (stage, fraction).
@@ -74,10 +75,16 @@ def fit(
     opened = Session.open(session)
     stages = Stages()
     with stages.stage("plan"):
-        plan = make_plan(opened, forced)
+        plan = make_plan(opened, forced, max_seconds)
     plan.check()
     with stages.stage("read"):
-        scene = load_scene(opened, frames=plan.frames, device=torch_device, progress=progress)
+        scene = load_scene(
+            opened,
+            frames=plan.frames,
+            undistort=plan.runs("undistortion"),
+            device=torch_device,
+            progress=progress,
+        )
     config = SolveConfig()
     with stages.stage("solve"):
         portrait = solve(scene, config, progress)

@@ -128,7 +128,7 @@ def framed(camera: Camera, points: torch.Tensor) -> Camera:
     K[:2, 2] -= low
     width, height = (int(side) for side in high - low)
     cropped = replace(camera, width=width, height=height, K=K)
-    return cropped.scaled(_LONGEST_SIDE_PX / max(width, height))
+    return _small(cropped)
 
 
 def exposure_for(radiance: torch.Tensor, mask: torch.Tensor) -> float:

@@ -117,6 +117,7 @@ def load_scene(
     session: Session,
     *,
     frames: Sequence[int],
+    undistort: bool = True,
     device: torch.device | str = "cpu",
     progress: Progress = no_progress,
 ) -> Scene:
@@ -125,6 +126,7 @@ def load_scene(
     Args:
         session: With poses and a cloud in its scene folder.
         frames: Indices to use; each has a pose and a flash flag.
+        undistort: Whether frames are resampled to a pinhole; without, their distortion is taken for none.
         device: Where the solve shall run.
         progress: Told ("read", fraction).
 
@@ -141,7 +143,7 @@ def load_scene(
         if camera is None or flash is None:
             missing = "pose" if camera is None else "flash flag"
             raise PlanError(f"Frame {index} of {session.path} has no {missing}; leave it out of the fit.")
-        if camera.distortion.any():
+        if undistort and camera.distortion.any():
             distorted[index] = camera
         views.append(View(index, replace(camera, distortion=np.zeros(0), flash=flash), flash))
     progress("read", 0.5)

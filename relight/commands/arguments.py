@@ -37,6 +37,16 @@ def add_forced(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_max_seconds(parser: argparse.ArgumentParser) -> None:
+    """A limit on the time of a fit."""
+    parser.add_argument(
+        "--max-seconds",
+        type=positive_number,
+        metavar="S",
+        help="leave out unlit frames until the fit should end within this time",
+    )
+
+
 def positive_number(text: str) -> float:
     """A finite number above zero, for argparse."""
     number = float(text)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from relight.commands.arguments import add_device, add_forced, add_session, positive_number
+from relight.commands.arguments import add_device, add_forced, add_max_seconds, add_session
 
 EXAMPLE = "relight fit S --preset solve --max-seconds 60"
 
@@ -19,9 +19,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="how: solve, the photometric solve without a network (default, and the only one so far)",
     )
     parser.add_argument("--name", metavar="NAME", help="what to call the portrait (default: its preset)")
-    parser.add_argument(
-        "--max-seconds", type=positive_number, metavar="S", help="end the refinement after this long"
-    )
+    add_max_seconds(parser)
     add_device(parser)
     add_forced(parser)
 

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from relight.commands.arguments import add_forced, add_session
+from relight.commands.arguments import add_forced, add_max_seconds, add_session
 
 if TYPE_CHECKING:
     from relight.plan import Plan
@@ -19,6 +20,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The flags of `relight plan`."""
     add_session(parser)
     add_forced(parser)
+    add_max_seconds(parser)
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the plan as JSON too")
 
 
@@ -26,9 +28,10 @@ def run(args: argparse.Namespace) -> None:
     """Prints the plan; a session that cannot be fitted is an error after its table."""
     from capture.atomic import atomic_write
     from capture.session import Session
-    from relight.plan import make_plan, parse_forced
+    from relight.plan import parse_forced
+    from relight.planning import make_plan
 
-    plan = make_plan(Session.open(args.session), parse_forced(args.force))
+    plan = make_plan(Session.open(args.session), parse_forced(args.force), args.max_seconds)
     print_plan(plan)
     if args.json:
         atomic_write(args.json, (json.dumps(plan.as_json(), indent=2) + "\n").encode())
@@ -36,7 +39,7 @@ def run(args: argparse.Namespace) -> None:
 
 
 def print_plan(plan: Plan) -> None:
-    """Prints the decisions and how long the fit should take."""
+    """Prints the decisions."""
     from rich.console import Console
     from rich.table import Table
 
@@ -46,6 +49,5 @@ def print_plan(plan: Plan) -> None:
     for decision in plan.decisions:
         action = f"{decision.action.value} (forced)" if decision.forced else decision.action.value
         table.add_row(decision.name, action, decision.reason, decision.saving)
-    console = Console()
-    console.print(table)
-    console.print(f"estimated time on two cores: {plan.estimated_s:.0f} s")
+    # In a file or a pipe no terminal sets the width: the reasons should not be cut to 80 columns.
+    Console(width=None if sys.stdout.isatty() else 140).print(table)

@@ -80,13 +80,9 @@ def run(args: argparse.Namespace) -> None:
     lights = parse_lights(args.light, Path.cwd()) | (load_lights(args.lights) if args.lights else {})
     is_video = args.out.suffix.lower() == ".mp4"
     if is_video and (args.cameras or args.maps or len(lights) != 1):
-        raise RenderError(
-            f"{args.out} is a video: it takes one --light; give --out a folder for the rest."
-        )
+        raise RenderError(f"{args.out} is a video: it takes one --light; give --out a folder for the rest.")
     if not lights and (args.orbit or not args.maps):
-        raise RenderError(
-            "There is nothing to render: name a --light or --lights, or ask for --maps."
-        )
+        raise RenderError("There is nothing to render: name a --light or --lights, or ask for --maps.")
     name = chosen_portrait(session.portraits_dir, args.portrait)
     portrait = load_portrait(session.portraits_dir / name, choose_device(args.device))
     with StageProgress() as progress:

@@ -12,7 +12,8 @@ from capture.images import write_png
 from capture.ply import PointCloud, write_ply
 from capture.session import Session
 from relight.errors import PlanError
-from relight.plan import DARK_FRAMES, Action, make_plan, parse_forced
+from relight.plan import Action, parse_forced
+from relight.planning import FEWEST_UNLIT, make_plan
 from relight.view_redundancy import ENOUGH_REPEATS
 
 WIDTH, HEIGHT = 64, 48
@@ -98,6 +99,7 @@ def test_a_session_with_poses_and_a_cloud_can_be_fitted(tmp_path):
         "normals": Action.RUN,
         "masks": Action.SKIP,
         "room_shading": Action.RUN,
+        "time": Action.RUN,
     }
     assert plan.frames == tuple(range(16))
     assert plan.left_out == {}
@@ -157,7 +159,7 @@ def test_a_dark_room_needs_no_shading_and_a_lit_one_does(tmp_path):
     dark = make_plan(make_session(tmp_path / "dark", flags, room=0.0))
     assert dark.decision("room_shading").action is Action.SKIP
     # 15 unlit frames, of which as many stay as a dark room needs.
-    assert list(dark.left_out.values()) == ["dark"] * (15 - DARK_FRAMES)
+    assert list(dark.left_out.values()) == ["dark"] * (15 - FEWEST_UNLIT)
     # 3 levels of 255 in a lit frame of 0.5: 2.3 %, above the 1 % of DARK_ROOM.
     dim = make_plan(make_session(tmp_path / "dim", room=3 / 255))
     assert dim.decision("room_shading").action is Action.RUN
@@ -182,6 +184,21 @@ def test_a_hand_that_stands_still_repeats_views_and_lit_ones_are_kept(tmp_path):
     assert set(still_lit) <= set(plan.frames)
     assert sorted(plan.left_out) == still_unlit[ENOUGH_REPEATS:]
     assert plan.left_out[39] == "same view as frame 19"
+
+
+def test_a_short_time_leaves_out_unlit_frames_evenly_and_never_too_many(tmp_path):
+    session = make_session(tmp_path / "s", (1, 0, 0, 0) * 10)
+    whole = make_plan(session)
+    allowed_s = 0.76 * whole.estimated_s
+    shorter = make_plan(session, max_seconds=allowed_s)
+    assert 0.7 * whole.estimated_s < shorter.estimated_s <= allowed_s
+    assert set(shorter.left_out.values()) == {"no_time"}
+    assert all(index in shorter.frames for index in range(0, 40, 4))  # the lit ones
+    # 20 of the 30 unlit frames: none is missing beside a missing one, and a lit one may lie between.
+    assert np.diff([index for index in shorter.frames if index % 4]).max() <= 3
+    least = make_plan(session, max_seconds=1e-9)
+    assert len(least.frames) == 10 + FEWEST_UNLIT
+    assert "allowed" in least.decision("time").reason
 
 
 def test_decisions_can_be_turned_round_and_say_so(tmp_path):
