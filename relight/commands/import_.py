@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from relight.commands.arguments import positive_number
+
 EXAMPLE = "relight import VID_20261102_101530.mp4 --poses cameras.json --points points.ply --out S"
 
 
@@ -36,7 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--rate",
-        type=float,
+        type=positive_number,
         default=6.0,
         metavar="HZ",
         help="frames kept of each second of a video beside the lit ones (default 6)",
