@@ -50,7 +50,7 @@ def write_report(session_path: Path, portrait: str) -> Path:
     metrics = _optional_json(folder / "metrics.json")
     plan = _optional_json(folder / "plan.json")
     sections = [
-        _warnings([*session.repairs, *metrics.get("warnings", [])]),
+        _warnings([*session.info.get("warnings", []), *session.repairs, *metrics.get("warnings", [])]),
         *_pictures(folder / "previews"),
         _measures(_optional_json(folder / "evaluation.json")),
         _plan(plan),

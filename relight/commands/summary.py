@@ -33,7 +33,7 @@ def describe_session(session: Session) -> str:
         f"poses     {_word(session.cameras_dir)}",
         f"cloud     {_word(session.points_path)}",
         f"masks     {_word(session.masks_dir)}",
-        *(f"note      {sentence}" for sentence in session.repairs),
+        *(f"note      {sentence}" for sentence in [*session.info.get("warnings", []), *session.repairs]),
         f"next      relight plan {session.path}",
     ]
     return "\n".join(lines)
