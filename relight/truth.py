@@ -1,6 +1,6 @@
 """A folder with ground truth: posed views, what a perfect portrait gives there, and lights to measure under.
 
-    cameras.json           views (those with split "val" are measured)
+    cameras_val.json       views to measure; else those of cameras.json with split "val"
     lights.json            lights, named as the pictures in relight/
     mask/XXXX.png          coverage of the head
     linear/XXXX.exr        the captured frame, linear; else the frame itself is compared
@@ -124,12 +124,14 @@ def load_truth(path: Path) -> Truth:
     """
     if not path.is_dir():
         raise TruthError(f"{path} is no folder; a truth is a folder with a cameras.json.")
-    files = [path / name for name in ("cameras.json", "cameras_val.json") if (path / name).is_file()]
+    files = [path / name for name in ("cameras_val.json", "cameras.json") if (path / name).is_file()]
     if not files:
         raise TruthError(f"{path} has no cameras.json; it says which views to measure.")
     notes = []
     posed = load_posed_set(files[0])
-    frames = [frame for frame in posed.frames if frame.split == "val"]
+    # A cameras_val.json lists validation views alone: a video's are none of its own frames.
+    held_out = files[0].name == "cameras_val.json"
+    frames = [frame for frame in posed.frames if held_out or frame.split == "val"]
     if not frames:
         notes.append(
             f"{files[0].name} names no validation views (split val); all {len(posed.frames)} are measured, "
