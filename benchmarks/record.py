@@ -1,4 +1,4 @@
-"""The form in which benchmarks keep their numbers: what ran, when, on what, and every number with its spread."""
+"""The form in which benchmarks keep their numbers: what ran, when, on what, and how far repeats spread."""
 
 from __future__ import annotations
 

@@ -1,15 +1,15 @@
-"""A subject whose surface, colour and lights are formulas, and frames of it made without any of relight's code.
+"""A subject whose surface, colour and lights are formulas, and frames of it made without relight's code.
 
-The surface is the zero of f(x) = |x / axes| - 1 - bump(x), an ellipsoid the size of a head with soft bumps. Rays
-are cut with it by marching and bisection, normals are its gradient, albedo and room light are smooth functions,
-and the flash is a near point beside the lens. Pixels are point samples at their centres (0.5), in the units of
-the project: metres, radiance 1.0 = white clip, OpenCV axes.
+The surface is the zero of f(x) = |x / axes| - 1 - bump(x), an ellipsoid the size of a head with soft bumps.
+Rays are cut with it by marching and bisection, normals are its gradient, albedo and room light are smooth
+functions, and the flash is a near point beside the lens. Pixels are point samples at their centres (0.5), in
+the units of the project: metres, radiance 1.0 = white clip, OpenCV axes.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -118,7 +118,7 @@ class Head:
         return (0.3 - distance)[:, None] * directions
 
     def flash_radiance(self, x, normals, albedo, flash, eye):
-        """Radiance [..., 3] that the flash at [3] adds, seen from [3]: Burley's diffuse and GGX, written out."""
+        """Radiance [..., 3] that the flash at [3] adds, seen from [3]: Burley's diffuse part and GGX."""
         to_light, to_eye = flash - x, eye - x
         square = (to_light**2).sum(axis=-1, keepdims=True)
         to_light = to_light / np.sqrt(square)
@@ -237,7 +237,7 @@ class MemoryScene:
     normals_world: torch.Tensor | None = None
     with_masks: bool = True
     flash_offset_cam_m: np.ndarray = field(default_factory=lambda: FLASH_OFFSET_CAM_M.copy())
-    device: torch.device = torch.device("cpu")
+    device: torch.device = field(default_factory=lambda: torch.device("cpu"))
     clip: float = 0.95
 
     @property
