@@ -27,8 +27,10 @@ from capture.cameras import Camera
 NEAR_M = 1e-3
 """Points nearer than this to the camera plane are not drawn: their projection has no meaning."""
 
-_EMPTY = torch.iinfo(torch.int64).max
 _ID_BITS = 32
+_EMPTY = 0x7F800000 << _ID_BITS
+"""Key of depth +inf, behind every point. `pad` takes its value as a float64, in which the largest int64 is
+none but this number is exact."""
 
 
 @dataclass(frozen=True)
@@ -116,8 +118,7 @@ def _ids(key: torch.Tensor) -> torch.Tensor:
 
 
 def _depths(key: torch.Tensor) -> torch.Tensor:
-    bits = (key >> _ID_BITS).to(torch.int32)
-    return torch.where(key == _EMPTY, torch.inf, bits.view(torch.float32))
+    return (key >> _ID_BITS).to(torch.int32).view(torch.float32)
 
 
 def gather_descriptors(descriptors: torch.Tensor, ids: torch.Tensor) -> torch.Tensor:
@@ -156,8 +157,10 @@ def rasterize_ids_reference(points_world: np.ndarray, camera: Camera, levels: in
     images = [np.full(size, -1, dtype=np.int64) for size in sizes]
     nearest = [np.full(size, np.inf, dtype=np.float32) for size in sizes]
     for index, point in enumerate(np.asarray(points_world, dtype=np.float64)):
+        if not np.isfinite(point).all():
+            continue
         x, y, z = camera.cam_from_world[:3, :3] @ point + camera.cam_from_world[:3, 3]
-        if not (np.isfinite([x, y, z]).all() and z > NEAR_M):
+        if z <= NEAR_M:
             continue
         u, v, _ = np.asarray(camera.K) @ np.array([x / z, y / z, 1.0])
         if not (0 <= u < camera.width and 0 <= v < camera.height):
