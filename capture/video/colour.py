@@ -26,7 +26,7 @@ Pixels = NDArray[np.uint8] | NDArray[np.uint16]
 LUMA_WEIGHTS = {"bt601": (0.299, 0.114), "bt709": (0.2126, 0.0722), "bt2020": (0.2627, 0.0593)}
 _SWSCALE_MATRIX = {"bt601": 5, "bt709": 1, "bt2020": 9}
 _SWSCALE_EXACT = (
-    Interpolation.BICUBIC
+    Interpolation.BILINEAR
     | Interpolation.ACCURATE_RND
     | Interpolation.FULL_CHR_H_INT
     | Interpolation.FULL_CHR_H_INP
