@@ -32,6 +32,7 @@ class Observations:
             the point, or sees it clipped or outside the mask.
         flash: [K] bool.
         flash_position_world: [K, 3].
+        view_direction_world: [K, 3], unit, from the middle of the points to the camera.
         outside: [P] float32, share of the frames with a mask, of those that have the point in the picture,
             in which it lies outside the mask: what is off the subject in a frame is not the subject,
             whether seen or hidden.
@@ -41,6 +42,7 @@ class Observations:
     cosine: torch.Tensor
     flash: torch.Tensor
     flash_position_world: torch.Tensor
+    view_direction_world: torch.Tensor
     outside: torch.Tensor
 
 
@@ -76,11 +78,13 @@ def observe_points(scene: Scene, surface: SurfaceCloud, progress: Progress = no_
             for view in scene.views
         ]
     )
+    centres = torch.stack([torch.as_tensor(view.camera.centre_world) for view in scene.views]).to(points)
     return Observations(
         radiance=radiance,
         cosine=cosine,
         flash=torch.tensor([view.flash == 1 for view in scene.views], device=scene.device),
         flash_position_world=flash_positions.to(points),
+        view_direction_world=torch.nn.functional.normalize(centres - points.mean(dim=0), dim=1),
         outside=off / in_picture.clamp(min=1.0),
     )
 

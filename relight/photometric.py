@@ -7,7 +7,8 @@ no-flash frame a point shows its room radiance; a flash frame adds
 
 (`relight.reflectance`), seen under as many light directions l as there are flash frames. The steps:
 
-1. room radiance: robust mean over the no-flash frames;
+1. room radiance: robust mean over the no-flash frames; to be taken off a flash frame, that of the no-flash
+   frames taken from about the same place, for the room's gloss moves with the camera;
 2. the scale of C_flash, the three reflectance numbers of the subject, and a gain for each flash frame
    (lamps droop);
 3. normals: robust least squares for b = albedo * n under the frames' light directions (Woodham 1980), with
@@ -48,6 +49,8 @@ _CHUNK = 1 << 16  # points at a time: [K, chunk, 3] arrays stay in tens of megab
 _SAMPLE = 20_000  # points from which global quantities are fitted
 _ROOM_RELATIVE = 0.06  # spread of a point's room radiance over the views that counts as noise, e.g. gloss
 _FLOOR = 0.004  # radiance of one 8-bit code in the shadows, and albedo that is as good as black
+_BESIDE_RAD = 0.07  # 4 degrees: a good deal less than the width of a highlight of skin
+_ROOM_PRIOR = 0.3  # weight of the mean over all views, in frames that face the point
 _OUTSIDE_LIMIT = (
     0.05  # share of the frames that may show a point off the subject: masks and poses err by a pixel
 )
@@ -203,17 +206,35 @@ def _room_radiance(observations: Observations) -> tuple[torch.Tensor, torch.Tens
 def _flash_part(
     observations: Observations, points: torch.Tensor, room: torch.Tensor, room_information: torch.Tensor
 ) -> _Flash:
-    """Flash-added radiance times d^2, without the flash's scale, and where it comes from."""
-    lit = observations.flash
+    """Flash-added radiance times d^2, without the flash's scale, and where it comes from.
+
+    What the room alone would have shown in a flash frame is taken from the no-flash frames beside it: the
+    room's gloss on the subject moves with the camera, and the mean over all views would not know.
+    """
+    lit, dark = observations.flash, ~observations.flash
     weight = (observations.cosine[lit] > 0).float() * (room_information > 0.5)
-    response = torch.empty_like(observations.radiance[lit])
-    to_light = torch.empty_like(response)
-    for k, position in enumerate(observations.flash_position_world[lit]):
-        towards = position - points
-        square = (towards * towards).sum(dim=1, keepdim=True)
-        to_light[k] = towards / square.sqrt().clamp(min=1e-12)
-        response[k] = (observations.radiance[lit.nonzero()[k, 0]] - room) * square * weight[k, :, None]
+    response, to_light = (points.new_empty(len(weight), len(points), 3) for _ in range(2))
+    nearness = _nearness(observations.view_direction_world[lit], observations.view_direction_world[dark])
+    positions = observations.flash_position_world[lit]
+    for part in _chunks(len(points)):
+        share = observations.cosine[dark, part]
+        beside = nearness @ (share[..., None] * observations.radiance[dark, part]).flatten(1)
+        total = (nearness @ share)[..., None] + _ROOM_PRIOR
+        beside = (beside.view(len(nearness), -1, 3) + _ROOM_PRIOR * room[part]) / total
+        towards = positions[:, None] - points[part]
+        square = (towards * towards).sum(dim=-1, keepdim=True)
+        to_light[:, part] = towards / square.sqrt().clamp(min=1e-12)
+        added = observations.radiance[lit, part] - beside
+        response[:, part] = added * square * weight[:, part, None]
     return _Flash(response, weight, to_light)
+
+
+def _nearness(of: torch.Tensor, others: torch.Tensor) -> torch.Tensor:
+    """How much views [K, 3] have in common with others [N, 3], by the angle between them: [K, N]."""
+    angle = torch.acos((of @ others.T).clamp(-1.0, 1.0))
+    # A capture may be sparse: its nearest neighbours count nevertheless.
+    width = angle.min(dim=1, keepdim=True).values.clamp(min=_BESIDE_RAD)
+    return torch.exp(-0.5 * (angle / width) ** 2)
 
 
 def _global_quantities(
