@@ -41,6 +41,7 @@ _NOISE_NEIGHBOURS = 16
 _OUTLIER_NEIGHBOURS = 8
 _SUPPORT_NEIGHBOURS = 34  # points in a smoothing disc after averaging to a third of its radius
 _MOST_NEIGHBOURS = 64
+_DECIDED = 0.3  # mean cosine to the cameras; at the horizon the z-buffer takes some of the far side for seen
 _CHUNK = 1 << 16  # points at a time where [P, k, 3] arrays are made: 50 MB
 
 
@@ -175,21 +176,34 @@ def orient(points: Floats, normals: Floats, cameras: Sequence[Camera], hints: Fl
     """Normals turned towards the cameras that see their points, or towards the given hints where there are
     any.
 
-    Which camera sees a point is told from a coarse z-buffer, without normals. Where that is undecided, as
-    at the edge of what any camera saw, the majority of the neighbours decides.
+    Which camera sees a point is told from a coarse z-buffer, without normals. Hints that are for the most
+    part contrary to the cameras are taken for turned inside out. Over what no camera saw but from the side,
+    the sign spreads from neighbour to neighbour.
     """
     cloud = torch.from_numpy(points)
-    towards = torch.zeros_like(cloud)
+    towards, cameras_seen = torch.zeros_like(cloud), torch.zeros(len(cloud))
     spacing = _mean_spacing(points)
     for camera in cameras[:: max(1, len(cameras) // 12)]:
         seen, directions = _unoccluded(cloud, camera, spacing)
         towards += seen[:, None] * directions
-    side = (torch.from_numpy(normals) * towards).sum(dim=1).numpy()
+        cameras_seen += seen
+    side = ((torch.from_numpy(normals) * towards).sum(dim=1) / cameras_seen.clamp(min=1.0)).numpy()
     if hints is not None:
-        by_hint = (normals * hints).sum(axis=1)
-        side = np.where(np.isfinite(by_hint) & (np.abs(by_hint) > 0.1), by_hint, side)
+        by_hint = np.nan_to_num((normals * hints).sum(axis=1))
+        if np.sign(by_hint * side).sum() < 0:
+            by_hint = -by_hint
+        side = np.where(np.abs(by_hint) > 0.1, np.sign(by_hint), side)
     normals = normals * np.where(side < 0, -1.0, 1.0).astype(np.float32)[:, None]
     _, ids = cKDTree(points).query(points, k=min(16, len(points)), workers=-1)
+    decided = np.abs(side) > _DECIDED
+    reached = ~decided
+    while decided.any() and reached.any():
+        missing = (~decided).nonzero()[0]
+        around = (decided[ids[missing]][..., None] * normals[ids[missing]]).sum(axis=1)
+        turned = missing[(normals[missing] * around).sum(axis=1) < 0]
+        normals[turned] *= -1.0
+        reached = decided[ids[missing]].any(axis=1)
+        decided[missing[reached]] = True
     for _ in range(3):
         majority = normals[ids].mean(axis=1)
         normals = (
