@@ -51,7 +51,7 @@ def fill_holes(points: Floats, normals: Floats, spacing: float, widest: float) -
     for rim in _rims(points[edge], _LINK * spacing):
         ids = edge[rim]
         extent = np.ptp(points[ids], axis=0)
-        if len(ids) >= _FEWEST and float(np.linalg.norm(extent)) <= widest:
+        if len(ids) >= _FEWEST and 0.0 < float(np.linalg.norm(extent)) <= widest:
             patch = _patch(points, normals, tree, ids, spacing)
             if patch is not None:
                 added.append(patch[0])
