@@ -128,7 +128,9 @@ class CaptureLight:
             return surface.albedo * falloff
         to_light, distance = direction_to(surface.points, position)
         to_view, _ = direction_to(surface.points, surface.vector(self.camera.centre_world))
-        response = self.reflectance.response(surface.albedo, surface.normals, to_light, to_view)
+        response = self.reflectance.response(
+            surface.albedo, surface.normals, to_light, to_view, surface.gloss
+        )
         return response / distance.clamp(min=MIN_DISTANCE_M) ** 2
 
 

@@ -44,6 +44,7 @@ class Maps:
         depth: [H, W] z along the optical axis, world units.
         points_world: [H, W, 3] world.
         confidence: [H, W] 0..1.
+        gloss: [H, W] factor on the reflectance's f0.
         point_ids: [H, W] int64, a point of the portrait seen in or near the pixel, -1 off the subject.
     """
 
@@ -55,6 +56,7 @@ class Maps:
     depth: torch.Tensor
     points_world: torch.Tensor
     confidence: torch.Tensor
+    gloss: torch.Tensor
     point_ids: torch.Tensor
 
 
@@ -83,6 +85,7 @@ def render_maps(portrait: Portrait, camera: Camera) -> Maps:
             portrait.room_radiance[seen],
             portrait.shading[seen, None],
             portrait.confidence[seen, None],
+            portrait.gloss[seen, None],
             z[:, None],
         ],
         dim=1,
@@ -95,7 +98,7 @@ def render_maps(portrait: Portrait, camera: Camera) -> Maps:
     support = mask > 0
     filled = torch.where(support, pull_push(sums, _COVERED), 0.0).permute(1, 2, 0)
     normals = filled[..., :3]
-    depth = filled[..., 11]
+    depth = filled[..., 12]
     return Maps(
         albedo=filled[..., 3:6].clamp(min=0.0),
         normals_world=normals / torch.linalg.vector_norm(normals, dim=-1, keepdim=True).clamp(min=1e-12),
@@ -105,6 +108,7 @@ def render_maps(portrait: Portrait, camera: Camera) -> Maps:
         depth=depth,
         points_world=torch.where(support[..., None], _unproject(depth, camera), 0.0),
         confidence=filled[..., 10].clamp(0.0, 1.0),
+        gloss=filled[..., 11].clamp(min=0.0),
         point_ids=_point_ids(rasterize_ids(points, camera, _ID_LEVELS), seen, support),
     )
 

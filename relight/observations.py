@@ -115,20 +115,22 @@ def visible_points(
         all.
     """
     uv_px, z = project(points, camera)
-    inside = (z > NEAR_M) & (uv_px >= 0).all(dim=1)
-    inside &= (uv_px[:, 0] < camera.width) & (uv_px[:, 1] < camera.height)
+    u, v = uv_px.unbind(1)
+    inside = (z > NEAR_M) & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
     if not inside.any():
         return uv_px, torch.zeros_like(z), inside
     focal_px = float(camera.K[0, 0])
     cell_px = max(2.0, cell * spacing * focal_px / float(z[inside].median()))
     columns, rows = int(camera.width / cell_px) + 1, int(camera.height / cell_px) + 1
-    grid = (uv_px / cell_px).nan_to_num(0.0).clamp(0, max(columns, rows)).long()
-    place = (grid[:, 1] * columns + grid[:, 0]).where(inside, 0)
+    # Outside the picture, behind the camera and for NaN any cell will do, for `inside` decides.
+    u, v = ((value / cell_px).where(inside, 0.0).long() for value in (u, v))
+    place = v * columns + u
     nearest = z.new_full((rows * columns,), torch.inf)
     nearest.scatter_reduce_(0, place[inside], z[inside], "amin")
     nearest = -torch.nn.functional.max_pool2d(-nearest.view(1, 1, rows, columns), 3, 1, 1).flatten()
     towards = torch.as_tensor(camera.centre_world).to(points) - points
-    cosine = (normals * towards).sum(dim=1) / torch.linalg.vector_norm(towards, dim=1).clamp(min=1e-12)
+    length = (towards * towards).sum(dim=1).sqrt()
+    cosine = (normals * towards).sum(dim=1) / length.clamp(min=1e-12)
     slope = (1.0 - cosine**2).clamp(min=0.0).sqrt() / cosine.clamp(min=0.15)
     allowed = tolerance * spacing + _SLANT * cell_px * z / focal_px * slope
     seen = inside & (cosine > 0) & (z <= nearest[place] + allowed)

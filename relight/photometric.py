@@ -28,16 +28,18 @@ taken for white.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
+import numpy as np
 import torch
+from scipy.spatial import cKDTree
 
 from relight.cloud import CloudConfig, prepare_cloud
 from relight.errors import PlanError
 from relight.infill import infill
 from relight.observations import Observations, observe_points
 from relight.portrait import Portrait
-from relight.reflectance import GRAZING, Reflectance, fit_reflectance
+from relight.reflectance import GRAZING, Reflectance, fit_local_gloss, fit_reflectance
 from relight.scene import Scene
 from relight.stages import Progress, no_progress
 
@@ -46,11 +48,15 @@ ALBEDO_95 = 0.6
 range."""
 
 _CHUNK = 1 << 16  # points at a time: [K, chunk, 3] arrays stay in tens of megabytes
-_SAMPLE = 20_000  # points from which global quantities are fitted
+_SAMPLE = 10_000  # points from which global quantities are fitted
 _ROOM_RELATIVE = 0.06  # spread of a point's room radiance over the views that counts as noise, e.g. gloss
 _FLOOR = 0.004  # radiance of one 8-bit code in the shadows, and albedo that is as good as black
 _BESIDE_RAD = 0.07  # 4 degrees: a good deal less than the width of a highlight of skin
 _ROOM_PRIOR = 0.3  # weight of the mean over all views, in frames that face the point
+_GLOSS_CUBE = 8.0  # spacings: gloss changes with the material, over centimetres
+_GLOSS_STEP = 4  # every so many points are enough for what is pooled
+_GLOSS_PRIOR = 8.0  # points whose word the subject's mean gloss counts for
+_GLOSS_LIMIT = 4.0
 _OUTSIDE_LIMIT = (
     0.05  # share of the frames that may show a point off the subject: masks and poses err by a pixel
 )
@@ -86,11 +92,17 @@ class _Flash:
         response: [K, P, 3], q of the module's docstring.
         weight: [K, P], 0 where nothing was observed.
         to_light: [K, P, 3], unit.
+        gloss: [P], factor on the subject's gloss.
     """
 
     response: torch.Tensor
     weight: torch.Tensor
     to_light: torch.Tensor
+    gloss: torch.Tensor
+
+    def of(self, part: slice) -> _Flash:
+        """Some of the points."""
+        return _Flash(self.response[:, part], self.weight[:, part], self.to_light[:, part], self.gloss[part])
 
     def cosine(self, normals: torch.Tensor) -> torch.Tensor:
         """[K, P] between normals and light directions."""
@@ -135,10 +147,12 @@ def solve(scene: Scene, config: SolveConfig = SolveConfig(), progress: Progress 
     scale, reflectance, gains = _global_quantities(flash, prior, config)
     normals, sigma = torch.empty_like(prior), points.new_empty(len(points))
     albedo, information, residual = torch.empty_like(prior), torch.empty_like(sigma), torch.empty_like(sigma)
-    relative = _relative_noise(flash, prior, scale, reflectance, gains)
+    flash = _normalised(flash, scale, gains)
+    flash = replace(flash, gloss=_local_gloss(flash, points, prior, reflectance, surface.spacing))
+    relative = _relative_noise(flash, prior, reflectance)
     prior_weight = (relative / config.normal_sigma_rad) ** 2
     for part in _chunks(len(points)):
-        chunk = _normalised(flash, part, scale, gains)
+        chunk = flash.of(part)
         normals[part] = _fit_normals(chunk, prior[part], reflectance, prior_weight, relative)
         albedo[part], information[part], residual[part], sigma[part] = _fit_albedo(
             chunk, normals[part], reflectance, relative
@@ -163,6 +177,7 @@ def solve(scene: Scene, config: SolveConfig = SolveConfig(), progress: Progress 
         albedo=albedo,
         room_radiance=room.clamp(min=0.0),
         shading=shading,
+        gloss=flash.gloss,
         confidence=share / (1.0 + share),
         albedo_sigma=(sigma * gauge).clamp(max=1.0),
         normal_sigma_rad=normal_sigma,
@@ -192,12 +207,13 @@ def _room_radiance(observations: Observations) -> tuple[torch.Tensor, torch.Tens
     rooms, informations = [], []
     for part in _chunks(observations.cosine.shape[1]):
         samples, weight = observations.radiance[dark, part], observations.cosine[dark, part]
-        robust = weight
-        for _ in range(_ITERATIONS):
-            total = robust.sum(dim=0).clamp(min=1e-6)
-            room = (robust[..., None] * samples).sum(dim=0) / total[:, None]
-            deviation = (samples - room).abs().mean(dim=-1) / (_ROOM_RELATIVE * room.mean(dim=-1) + _FLOOR)
-            robust = weight / (1.0 + (0.5 * deviation) ** 2)
+        luminance, robust = samples.sum(dim=-1) / 3.0, weight
+        for _ in range(_ITERATIONS - 1):
+            mean = (robust * luminance).sum(dim=0) / robust.sum(dim=0).clamp(min=1e-6)
+            deviation = (luminance - mean) / (2.0 * (_ROOM_RELATIVE * mean + _FLOOR))
+            robust = weight / (1.0 + deviation * deviation)
+        total = robust.sum(dim=0).clamp(min=1e-6)
+        room = torch.einsum("kp,kpc->pc", robust, samples) / total[:, None]
         rooms.append(room)
         informations.append(weight.sum(dim=0))
     return torch.cat(rooms), torch.cat(informations)
@@ -226,7 +242,7 @@ def _flash_part(
         to_light[:, part] = towards / square.sqrt().clamp(min=1e-12)
         added = observations.radiance[lit, part] - beside
         response[:, part] = added * square * weight[:, part, None]
-    return _Flash(response, weight, to_light)
+    return _Flash(response, weight, to_light, points.new_ones(len(points)))
 
 
 def _nearness(of: torch.Tensor, others: torch.Tensor) -> torch.Tensor:
@@ -243,19 +259,15 @@ def _global_quantities(
     """Scale of C_flash, reflectance of the subject and gain of each flash frame [K], from a sample of the
     points."""
     step = max(1, flash.weight.shape[1] // _SAMPLE)
-    sample = slice(None, None, step)
+    flash, normals = flash.of(slice(None, None, step)), normals[::step]
     gains = flash.response.new_ones(len(flash.response))
     matte = Reflectance()
-    cosine = flash.cosine(normals)[:, sample]
-    weight = flash.weight[:, sample]
-    response = flash.response[:, sample].mean(dim=-1)
-    albedo, information, _, _ = _fit_albedo(
-        _Flash(response[..., None], weight, flash.to_light[:, sample]), normals[sample], matte, None
-    )
+    cosine, weight, response = flash.cosine(normals), flash.weight, flash.response.mean(dim=-1)
+    albedo, information, _, _ = _fit_albedo(flash, normals, matte, None)
     seen = information > config.known
     if not bool(seen.any()):
         return 1.0, matte, gains
-    scale = float(torch.quantile(albedo[seen, 0], 0.95).clamp(min=1e-9)) / ALBEDO_95
+    scale = float(torch.quantile(albedo[seen].mean(dim=1), 0.95).clamp(min=1e-9)) / ALBEDO_95
     reflectance = matte
     for _ in range(2):
         scaled = response / scale / gains[:, None]
@@ -284,20 +296,45 @@ def _frame_gains(
     return (gains / gains.median()).clamp(0.5, 2.0)
 
 
-def _normalised(flash: _Flash, part: slice, scale: float, gains: torch.Tensor) -> _Flash:
-    """The observations of some points in units of the albedo."""
-    factor = (1.0 / (scale * gains))[:, None, None]
-    return _Flash(flash.response[:, part] * factor, flash.weight[:, part], flash.to_light[:, part])
+def _normalised(flash: _Flash, scale: float, gains: torch.Tensor) -> _Flash:
+    """The observations in units of the albedo; in place, for a copy would be large."""
+    flash.response.mul_((1.0 / (scale * gains))[:, None, None])
+    return flash
 
 
-def _relative_noise(
-    flash: _Flash, normals: torch.Tensor, scale: float, reflectance: Reflectance, gains: torch.Tensor
-) -> float:
+def _local_gloss(
+    flash: _Flash, points: torch.Tensor, normals: torch.Tensor, reflectance: Reflectance, spacing: float
+) -> torch.Tensor:
+    """Factor on f0 for each point [P], pooled over cubes and smoothed between them.
+
+    Few points see a light near enough to their mirror direction to know their own gloss; a few hundred do.
+    """
+    if reflectance.f0 <= 0:
+        return torch.ones_like(flash.gloss)
+    some = slice(None, None, _GLOSS_STEP)
+    sample, places = flash.of(some), points[some]
+    cosine, response = sample.cosine(normals[some]), sample.response.mean(dim=-1)
+    sides = torch.stack(fit_local_gloss(cosine, response, sample.weight, reflectance), dim=1)
+    cube = ((places - places.min(dim=0).values) / (_GLOSS_CUBE * spacing)).long()
+    _, member = torch.unique(cube, dim=0, return_inverse=True)
+    count = int(member.max()) + 1
+    sums = places.new_zeros(count, 5).index_add_(0, member, torch.cat([sides, places], dim=1))
+    sizes = torch.bincount(member, minlength=count).to(points)
+    tree = cKDTree((sums[:, 2:] / sizes[:, None]).cpu().numpy())
+    distances, near = tree.query(points.cpu().numpy(), k=list(range(1, min(8, count) + 1)), workers=-1)
+    weight = torch.from_numpy(np.exp(-0.5 * (distances / (_GLOSS_CUBE * spacing)) ** 2)).to(points)
+    pooled = (weight[..., None] * sums[torch.from_numpy(near).to(points.device), :2]).sum(dim=1)
+    known = sides[:, 1][sides[:, 1] > 0]
+    prior = _GLOSS_PRIOR * float(known.median()) if len(known) else 1.0
+    own = (pooled[:, 0] + prior * reflectance.f0) / (pooled[:, 1] + prior)
+    return (own / reflectance.f0).clamp(0.0, _GLOSS_LIMIT)
+
+
+def _relative_noise(flash: _Flash, normals: torch.Tensor, reflectance: Reflectance) -> float:
     """Robust standard deviation of a flash observation relative to its albedo, with the geometric normals."""
     step = max(1, flash.weight.shape[1] // _SAMPLE)
-    sample = slice(None, None, step)
-    chunk = _normalised(flash, sample, scale, gains)
-    albedo, information, residual, _ = _fit_albedo(chunk, normals[sample], reflectance, None)
+    sample = flash.of(slice(None, None, step))
+    albedo, information, residual, _ = _fit_albedo(sample, normals[::step], reflectance, None)
     used = (information > 0.5) & (albedo.mean(dim=1) > 10 * _FLOOR)
     if not bool(used.any()):
         return 0.06
@@ -316,7 +353,7 @@ def _fit_normals(
         diffuse = reflectance.diffuse(cosine)
         # diffuse(c) = gain c: with the gain of the last normal the model is linear in b = albedo n.
         gain = diffuse / cosine.clamp(min=1e-3)
-        matte = response - reflectance.gloss(cosine)
+        matte = response - reflectance.gloss(cosine) * flash.gloss
         weight = flash.weight * (cosine > GRAZING) * cosine
         albedo = (weight * diffuse * matte).sum(dim=0) / (weight * diffuse**2).sum(dim=0).clamp(min=1e-6)
         deviation = (matte - albedo * diffuse) / (relative * albedo.abs() + _FLOOR)
@@ -341,7 +378,7 @@ def _fit_albedo(
     robust."""
     cosine = flash.cosine(normals)
     diffuse = reflectance.diffuse(cosine)
-    matte = flash.response - reflectance.gloss(cosine)[..., None]
+    matte = flash.response - (reflectance.gloss(cosine) * flash.gloss)[..., None]
     weight = flash.weight * (cosine > GRAZING) * cosine.clamp(min=0.0)
     robust = weight
     for iteration in range(_ITERATIONS if relative is not None else 1):

@@ -34,6 +34,7 @@ _TENSORS = {
     "albedo": 3,
     "room_radiance": 3,
     "shading": 0,
+    "gloss": 0,
     "confidence": 0,
     "albedo_sigma": 0,
     "normal_sigma_rad": 0,
@@ -53,6 +54,7 @@ class Portrait:
         room_radiance: [P, 3] linear radiance under the room's light, colour of the room's light included.
             The paper's A * C_room * s is its grey approximation.
         shading: [P] room shading s, 0..1.
+        gloss: [P] factor on the reflectance's f0: cloth has less of it than skin.
         confidence: [P] 0..1, how well the flash observed the point; 0 = filled in from neighbours.
         albedo_sigma: [P] standard error of the albedo (mean of channels), infinite nowhere: 1 where unknown.
         normal_sigma_rad: [P] standard error of the normal, radians.
@@ -70,6 +72,7 @@ class Portrait:
     albedo: torch.Tensor
     room_radiance: torch.Tensor
     shading: torch.Tensor
+    gloss: torch.Tensor
     confidence: torch.Tensor
     albedo_sigma: torch.Tensor
     normal_sigma_rad: torch.Tensor
@@ -92,7 +95,7 @@ class Portrait:
     def save(self, folder: Path) -> None:
         """Writes the two files; each is there whole or not at all."""
         folder.mkdir(parents=True, exist_ok=True)
-        tensors = {name: getattr(self, name).detach().cpu().float().contiguous() for name in _TENSORS}
+        tensors = {name: getattr(self, name).detach().cpu().float().clone() for name in _TENSORS}
         content = {"schema": "relight-portrait", "version": VERSION, "points": len(self.points)}
         for field in fields(self):
             if field.name not in _TENSORS and field.name != "reflectance":

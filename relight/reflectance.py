@@ -54,7 +54,12 @@ class Reflectance:
         return self.f0 * gloss_lobe(cosine, self.alpha)
 
     def response(
-        self, albedo: torch.Tensor, normals: torch.Tensor, to_light: torch.Tensor, to_view: torch.Tensor
+        self,
+        albedo: torch.Tensor,
+        normals: torch.Tensor,
+        to_light: torch.Tensor,
+        to_view: torch.Tensor,
+        gloss: torch.Tensor | None = None,
     ) -> torch.Tensor:
         """Radiance under a light of unit colour at unit distance, for any directions.
 
@@ -67,6 +72,7 @@ class Reflectance:
             normals: [..., 3], unit, or 0 where no surface is known: there the response is 0.
             to_light: [..., 3], unit.
             to_view: [..., 3], unit.
+            gloss: [..., 1], factor on f0 of each point; by default 1.
 
         Returns:
             [..., 3], 0 where the light is behind the surface.
@@ -84,7 +90,9 @@ class Reflectance:
         result = albedo * diffuse
         if self.f0 > 0:
             k, square = self.alpha / 2.0, self.alpha**2
-            fresnel = self.f0 + (1.0 - self.f0) * (1.0 - deviation) ** 5
+            f0 = self.f0 if gloss is None else self.f0 * gloss
+            # Schlick's term grows with the factor too: what has no gloss has none at any angle.
+            fresnel = f0 + f0 / self.f0 * (1.0 - self.f0) * (1.0 - deviation) ** 5
             normal = (normals * half).sum(dim=-1, keepdim=True).clamp(0.0, 1.0)
             masking = 4.0 * (light * (1.0 - k) + k) * (view * (1.0 - k) + k)
             result = result + fresnel * square * light / (masking * (normal**2 * (square - 1.0) + 1.0) ** 2)
@@ -127,16 +135,56 @@ def fit_reflectance(cosine: torch.Tensor, response: torch.Tensor, weight: torch.
 def _fit_f0(
     diffuse: torch.Tensor, lobe: torch.Tensor, response: torch.Tensor, weight: torch.Tensor
 ) -> tuple[float, float]:
-    """f0 >= 0 and the robust loss, with each point's albedo projected out of the problem."""
+    """Mean f0 >= 0 and the robust loss, with albedo and gloss of each point projected out of the problem.
+
+    A subject is skin, hair and cloth: with one f0 for all of them the widths would be bent to fit the
+    mixture.
+    """
+    along, square, left = _gloss_normal_equations(diffuse, lobe, response, weight)
+    used = (square > 0) & (weight > 0).any(dim=0)
+    f0 = max(0.0, float(along.sum(dtype=torch.float64) / square.sum(dtype=torch.float64).clamp(min=1e-12)))
+    prior = float(square[used].median()) if bool(used.any()) else 1.0
+    own = ((along + prior * f0) / (square + prior).clamp(min=1e-12)).clamp(min=0.0)
+    residual = (left[0] - own * left[1]) / _SCALE
+    loss = (weight * torch.log1p(residual**2)).sum(dtype=torch.float64) / weight.sum(dtype=torch.float64)
+    return f0, float(loss)
+
+
+def fit_local_gloss(
+    cosine: torch.Tensor, response: torch.Tensor, weight: torch.Tensor, reflectance: Reflectance
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """What each point says of its own f0: the two sides of its normal equation, to be pooled with neighbours.
+
+    Args:
+        cosine: [K, P].
+        response: [K, P], scaled as for `fit_reflectance`.
+        weight: [K, P].
+        reflectance: Gives the curves.
+
+    Returns:
+        [P] right-hand sides and [P] squares; f0 of any group of points is the ratio of their sums.
+    """
+    weight = weight * (cosine > GRAZING) * cosine.clamp(min=0.0)
+    weight = weight * ((weight > 0).sum(dim=0) >= 3)
+    along, square, _ = _gloss_normal_equations(
+        reflectance.diffuse(cosine), gloss_lobe(cosine, reflectance.alpha), response, weight
+    )
+    return along, square
+
+
+def _gloss_normal_equations(
+    diffuse: torch.Tensor, lobe: torch.Tensor, response: torch.Tensor, weight: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor, tuple[torch.Tensor, torch.Tensor]]:
+    """Sides of each point's equation for f0 [P], and response and lobe [K, P] without their diffuse part."""
     robust = weight
     for _ in range(_ITERATIONS):
         weighted = robust * diffuse
         norm = (weighted * diffuse).sum(dim=0).clamp(min=1e-9)
         response_left = response - diffuse * ((weighted * response).sum(dim=0) / norm)
         lobe_left = lobe - diffuse * ((weighted * lobe).sum(dim=0) / norm)
-        along = float((robust * response_left * lobe_left).sum(dtype=torch.float64))
-        f0 = max(0.0, along / max(float((robust * lobe_left**2).sum(dtype=torch.float64)), 1e-12))
-        residual = (response_left - f0 * lobe_left) / _SCALE
+        along = (robust * response_left * lobe_left).sum(dim=0)
+        square = (robust * lobe_left**2).sum(dim=0)
+        own = (along / square.clamp(min=1e-9)).clamp(min=0.0)
+        residual = (response_left - own * lobe_left) / _SCALE
         robust = weight / (1.0 + residual**2)
-    loss = (weight * torch.log1p(residual**2)).sum(dtype=torch.float64) / weight.sum(dtype=torch.float64)
-    return f0, float(loss)
+    return along, square, (response_left, lobe_left)

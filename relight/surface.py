@@ -23,7 +23,8 @@ class SurfaceMaps(Protocol):
     """What can be shaded: maps of a view, [...] = [H, W], or arrays of points, [...] = [P].
 
     Maps may also have a `room_radiance` [..., 3], linear: what the room's light makes of the surface, in
-    colour. It then takes the place of albedo * C_room * shading.
+    colour. It then takes the place of albedo * C_room * shading. And a `gloss` [...], a factor on the gloss
+    of a reflectance.
     """
 
     @property
@@ -94,6 +95,12 @@ class Surface:
         """[P, 3], linear, under the room's light; None where the maps know only a grey shading."""
         radiance = getattr(self._maps, "room_radiance", None)
         return None if radiance is None else self._gather(radiance)
+
+    @cached_property
+    def gloss(self) -> Tensor | None:
+        """[P, 1], factor on the reflectance's gloss; None where the maps know of none."""
+        gloss = getattr(self._maps, "gloss", None)
+        return None if gloss is None else self._gather(gloss[..., None])
 
     @cached_property
     def points(self) -> Tensor:
