@@ -77,17 +77,16 @@ def fit(
     with stages.stage("plan"):
         plan = make_plan(opened, forced, max_seconds)
     plan.check()
-    with stages.stage("read"):
+    config = SolveConfig()
+    with stages.follow(progress) as told:
         scene = load_scene(
             opened,
             frames=plan.frames,
             undistort=plan.runs("undistortion"),
             device=torch_device,
-            progress=progress,
+            progress=told,
         )
-    config = SolveConfig()
-    with stages.stage("solve"):
-        portrait = solve(scene, config, progress)
+        portrait = solve(scene, config, told)
 
     folder = opened.portraits_dir / name
     folder.mkdir(parents=True, exist_ok=True)

@@ -34,6 +34,31 @@ class Stages:
         finally:
             self.seconds[name] = self.seconds.get(name, 0.0) + self._clock() - started_s
 
+    @contextmanager
+    def follow(self, progress: Progress) -> Iterator[Progress]:
+        """Times the stages that are named to the progress it gives, each until the next one is named."""
+        current = ""
+        since_s = self._clock()
+
+        def end_stage() -> None:
+            nonlocal since_s
+            now_s = self._clock()
+            if current:  # what precedes the first name belongs to it
+                self.seconds[current] = self.seconds.get(current, 0.0) + now_s - since_s
+                since_s = now_s
+
+        def told(stage: str, fraction: float) -> None:
+            nonlocal current
+            if stage != current:
+                end_stage()
+                current = stage
+            progress(stage, fraction)
+
+        try:
+            yield told
+        finally:
+            end_stage()
+
     @property
     def total_s(self) -> float:
         """Seconds of all stages."""
