@@ -81,8 +81,8 @@ def compare(case: Case, folder: Path) -> dict[str, Any]:
 
 
 def _solve_s(portrait: Path) -> float:
-    seconds = json.loads((portrait / "metrics.json").read_text())["seconds"]
-    return float(seconds["read"] + seconds["solve"])
+    seconds: dict[str, float] = json.loads((portrait / "metrics.json").read_text())["seconds"]
+    return sum(seconds[stage] for stage in ("read", "cloud", "observe", "solve"))
 
 
 def _measures(session: Path, truth: Path, name: str) -> dict[str, float]:

@@ -41,8 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> None:
     """Films, imports, fits, measures, renders and reports; says where everything is."""
     from capture.importers import ImportOptions, import_source
-    from capture.sim.rig import RigConfig
-    from capture.sim.simulate import simulate_video
+    from capture.sim import RigConfig, simulate_video
     from capture.terminal import StageProgress
     from relight.commands.evaluate import evaluate_portrait
     from relight.commands.summary import describe_session
@@ -60,12 +59,14 @@ def run(args: argparse.Namespace) -> None:
         portrait = fit(session, device=args.device, progress=progress)
         table = evaluate_portrait(session, filmed, portrait.name, progress=progress)
         _render(imported, portrait, filmed, out, progress)
+    _write_sheet(portrait / "previews", out / "relit.jpg")
     shutil.copyfile(portrait / "report.html", out / "report.html")
     print(describe_session(imported))
     print()
     print(table)
     print()
     print(f"film      {video}")
+    print(f"relit     {out / 'relit.jpg'}")
     print(f"pictures  {out / 'pictures'}")
     print(f"orbit     {out / 'orbit.mp4'}")
     print(f"report    {out / 'report.html'}  (open it in a browser)")
@@ -102,3 +103,13 @@ def _render(session: Session, folder: Path, filmed: Path, out: Path, progress: P
     render_orbits(
         session, portrait, {name: lights[name]}, {name: out / "orbit.mp4"}, _ORBIT_S, True, progress
     )
+
+
+def _write_sheet(previews: Path, file: Path) -> None:
+    """The relit previews side by side."""
+    import numpy as np
+
+    from capture.images import read_image, write_jpeg
+
+    pictures = [read_image(path) for path in sorted(previews.glob("relit_*.jpg"))]
+    write_jpeg(file, np.concatenate(pictures, axis=1), quality=90)
