@@ -14,7 +14,7 @@ from capture.sim.visibility import depth_visibility
 from capture.transfer import to_display
 
 _STRAND_SHARE = 0.03  # of the points lie on loose strands
-_FLOOR_M = -0.27  # below, the bust is cut off; no camera looks there
+_FLOOR_M = -0.36  # below, the bust is cut off; no camera looks there
 _NOISE_M = 0.0005
 _BUMPS_M = 0.0004
 _BUMP_SCALE_M = 0.02
