@@ -9,6 +9,7 @@ Nothing that is loaded can run code.
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
@@ -20,6 +21,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save
 
 from capture.atomic import atomic_write
+from capture.json_fields import parse_json
 from relight.errors import PortraitError
 from relight.reflectance import Reflectance
 
@@ -101,8 +103,11 @@ class Portrait:
             if field.name not in _TENSORS and field.name != "reflectance":
                 content[field.name] = getattr(self, field.name)
         content["reflectance"] = asdict(self.reflectance)
+        text = (
+            json.dumps(content, indent=2, allow_nan=False) + "\n"
+        )  # before a file is touched: this can fail
         atomic_write(folder / TENSORS_FILE, save(tensors))
-        atomic_write(folder / FIELDS_FILE, (json.dumps(content, indent=2, allow_nan=False) + "\n").encode())
+        atomic_write(folder / FIELDS_FILE, text.encode())
 
 
 def load_portrait(folder: Path, device: torch.device | str = "cpu") -> Portrait:
@@ -118,7 +123,7 @@ def load_portrait(folder: Path, device: torch.device | str = "cpu") -> Portrait:
                 f"There is no portrait in {folder} ({file} is missing); run `relight fit` first."
             )
     try:
-        content = json.loads((folder / FIELDS_FILE).read_bytes())
+        content = parse_json((folder / FIELDS_FILE).read_bytes())
         if content["schema"] != "relight-portrait":
             raise ValueError("it is no portrait")
         version = content["version"]
@@ -134,21 +139,37 @@ def load_portrait(folder: Path, device: torch.device | str = "cpu") -> Portrait:
     try:
         tensors = load_file(folder / TENSORS_FILE, device=str(device))
         count = int(content["points"])
+        if count < 1:
+            raise ValueError("it has no points")
         for name, width in _TENSORS.items():
-            shape = (count, width) if width else (count,)
-            if tuple(tensors[name].shape) != shape or not torch.isfinite(tensors[name]).all():
-                raise ValueError(f"{name} is not a finite array of shape {list(shape)}")
+            shape, values = (count, width) if width else (count,), tensors[name]
+            if tuple(values.shape) != shape or values.dtype != torch.float32 or not values.isfinite().all():
+                raise ValueError(f"{name} is not a finite float32 array of shape {list(shape)}")
         return Portrait(
             **{name: tensors[name] for name in _TENSORS},
-            spacing=float(content["spacing"]),
+            spacing=_positive(content["spacing"]),
             c_room=_vector(content["c_room"]),
             c_flash=_vector(content["c_flash"]),
             flash_offset_cam_m=_vector(content["flash_offset_cam_m"]),
-            reflectance=Reflectance(**content["reflectance"]),
+            reflectance=_reflectance(**content["reflectance"]),
             info=dict(content["info"]),
         )
-    except (SafetensorError, OSError, ValueError, KeyError, TypeError) as error:
+    except (SafetensorError, OSError, ValueError, KeyError, TypeError, OverflowError) as error:
         raise PortraitError(f"The portrait in {folder} is damaged ({error}); fit it again.") from error
+
+
+def _positive(value: Any) -> float:
+    number = float(value)
+    if not 0.0 < number < math.inf:
+        raise ValueError(f"{number} is not a finite number above 0")
+    return number
+
+
+def _reflectance(retro: Any, alpha: Any, f0: Any) -> Reflectance:
+    retro, f0 = float(retro), float(f0)
+    if not (0.0 <= retro < math.inf and 0.0 <= f0 < math.inf):
+        raise ValueError(f"retro {retro} and f0 {f0} are not both finite and at least 0")
+    return Reflectance(retro, _positive(alpha), f0)
 
 
 def _vector(values: Any) -> tuple[float, float, float]:

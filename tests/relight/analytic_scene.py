@@ -21,12 +21,26 @@ from capture.cameras import Camera
 from capture.images import write_png
 from capture.ply import PointCloud, write_ply
 from capture.session import FrameRecord, Session
+from relight.portrait import Portrait
+from relight.reflectance import Reflectance
 from relight.scene import Observation, View
 
 AXES_M = np.array([0.085, 0.115, 0.100])
 FLASH_OFFSET_CAM_M = np.array([0.015, -0.01, 0.0])
 C_FLASH = 0.11  # radiance of a white surface that faces the flash from one metre, all channels
 _WAVES = np.array([[55.0, 20.0, -15.0], [-25.0, 50.0, 35.0], [10.0, -45.0, 60.0]])  # rad / m
+PORTRAIT_TENSORS = {
+    "points": 3,
+    "normals_world": 3,
+    "albedo": 3,
+    "room_radiance": 3,
+    "shading": 0,
+    "gloss": 0,
+    "confidence": 0,
+    "albedo_sigma": 0,
+    "normal_sigma_rad": 0,
+    "residual": 0,
+}
 _PHASES = np.array([0.3, 1.1, 2.0])
 
 
@@ -274,3 +288,31 @@ def write_session(path: Path, frames: Sequence[Frame], cloud: PointCloud, *, tra
         offset = Quantity.of(FLASH_OFFSET_CAM_M, "m", "analytic scene")
         save_calibration(Calibration(flash_offset_cam_m=offset), session.calibration_path)
     return session
+
+
+def portrait_of(points, normals, spacing, **given) -> Portrait:
+    """A portrait of points [P, 3] and normals [P, 3], all else 1 (colours 0.1) where it is not given."""
+    tensors = {"points": points, "normals_world": normals} | {
+        name: given.pop(name) for name in list(given) if name in PORTRAIT_TENSORS
+    }
+    count = len(points)
+    for name, width in PORTRAIT_TENSORS.items():
+        value = torch.as_tensor(np.asarray(tensors.get(name, 1.0)), dtype=torch.float32)
+        tensors[name] = value.expand(count, width).clone() if width else value.expand(count).clone()
+    numbers = {
+        "c_room": (0.1, 0.1, 0.1),
+        "c_flash": (0.1, 0.1, 0.1),
+        "flash_offset_cam_m": (0.0, 0.0, 0.0),
+        "reflectance": Reflectance(),
+        "info": {},
+    }
+    return Portrait(**tensors, spacing=spacing, **(numbers | given))
+
+
+def sphere_portrait(count=20_000, radius=0.1, **given) -> Portrait:
+    """An even sphere about the origin."""
+    i = np.arange(count) + 0.5
+    z, phi = 1 - 2 * i / count, i * np.pi * (3 - np.sqrt(5))
+    ring = np.sqrt(1 - z * z)
+    normals = np.stack([ring * np.cos(phi), ring * np.sin(phi), z], axis=1)
+    return portrait_of(radius * normals, normals, radius * float(np.sqrt(4 * np.pi / count)), **given)
