@@ -80,7 +80,7 @@ def import_videos(
     posed = match_poses(scene, np.concatenate(pts_of_parts), warnings)
     progress("tagging", 0.0)
     records = blank_records(recording, survey, times, evidence, posed)
-    records, tags = tag_records(records, survey, times, options)
+    records, tags = tag_records(records, survey, times, options, warnings)
     records = select_records(records, posed, options)
     progress("tagging", 1.0)
 
@@ -95,10 +95,7 @@ def import_videos(
         flash_schedule=evidence.flash_schedule,
     )
     with session:
-        if tags is not None:
-            warnings += tags.warnings
-            session.update_info(tagging=_describe_tags(tags, times))
-        session.update_info(warnings=warnings)
+        session.update_info(warnings=warnings, tagging=_describe_tags(tags, times) if tags else None)
         write_frames(session, recording, records, progress)
         kept = [record.index for record in records if record.file is not None]
         save_video_scene(scene, posed, kept, session)
@@ -181,12 +178,30 @@ def _describe_source(recording: Recording, evidence: Evidence, options: ImportOp
 
 
 def _describe_tags(tags: TagResult, times: FrameTimes) -> dict[str, Any]:
-    """What session.json says of the pulses that were found."""
+    """What session.json says of the flash and the shutter as the pictures show them."""
+    numbers = (
+        "period_s",
+        "period_sigma_s",
+        "jitter_s",
+        "readout_s",
+        "readout_sigma_s",
+        "exposure_s",
+        "exposure_sigma_s",
+        "flicker_hz",
+        "flicker_depth",
+    )
+    pulse_numbers = ("t_on_s", "t_off_s", "t_on_sigma_s", "t_off_sigma_s", "gain")
+    prior = None
+    if times.prior is not None and tags.prior is not None:
+        prior = {
+            "source": times.prior.source,
+            "offset_s": tags.prior.offset_s,
+            "jitter_s": tags.prior.jitter_s,
+            "matched": tags.prior.matched,
+        }
     return {
-        "period_s": tags.period_s,
-        "readout_s": tags.readout_s,
-        "prior": times.prior.source if times.prior is not None else None,
-        "pulses": [
-            {"t_on_s": pulse.t_on_s, "t_off_s": pulse.t_off_s, "gain": pulse.gain} for pulse in tags.pulses
-        ],
+        **{name: getattr(tags, name) for name in numbers},
+        "missed_s": list(tags.missed_s),
+        "prior": prior,
+        "pulses": [{name: getattr(pulse, name) for name in pulse_numbers} for pulse in tags.pulses],
     }

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from capture.cameras import PosedFrame
+from capture.errors import TaggingError
 from capture.importers.flash_list import read_flash_list
 from capture.importers.options import ImportOptions
 from capture.importers.recording_parts import Recording
@@ -15,7 +16,7 @@ from capture.importers.sidecar_evidence import Evidence, FrameTimes
 from capture.importers.video_survey import Survey
 from capture.selection import Candidate, find_blurred, select_frames
 from capture.session import EXCLUDING_REASONS, FrameRecord
-from capture.tagging import TagResult, tag
+from capture.tagging import FlashPrior, TagResult, tag
 
 _GAP = 1.6  # of the usual frame interval, from which frames are missing before a frame
 
@@ -54,9 +55,17 @@ def blank_records(
 
 
 def tag_records(
-    records: Sequence[FrameRecord], survey: Survey, times: FrameTimes, options: ImportOptions
+    records: Sequence[FrameRecord],
+    survey: Survey,
+    times: FrameTimes,
+    options: ImportOptions,
+    warnings: list[str],
 ) -> tuple[list[FrameRecord], TagResult | None]:
-    """The flash of every frame: from the user's list, or from the pictures."""
+    """The flash of every frame: from the user's list, or from the pictures, checked against the sidecars.
+
+    Raises:
+        TaggingError: the pictures show no blinking flash.
+    """
     if options.flash_list is not None:
         flags = read_flash_list(options.flash_list, [f"{record.index:06d}" for record in records])
         listed = zip(records, flags, strict=True)
@@ -64,7 +73,8 @@ def tag_records(
             replace(record, flash=flag, reasons=(*record.reasons, *(("untagged",) if flag is None else ())))
             for record, flag in listed
         ], None
-    result = tag(survey.profiles, schedule=times.prior)
+    result = _tag_with_prior(survey, times.prior, warnings)
+    warnings += result.warnings
     tagged = list(records)
     sound = [record.index for record in records if "unreadable" not in record.reasons]
     for index, frame in zip(sound, result.frames, strict=True):
@@ -73,9 +83,21 @@ def tag_records(
             flash=frame.flash,
             lit_fraction=frame.lit_fraction,
             confidence=frame.confidence,
-            reasons=(*records[index].reasons, *frame.reasons),
+            reasons=tuple(dict.fromkeys((*records[index].reasons, *frame.reasons))),
         )
     return tagged, result
+
+
+def _tag_with_prior(survey: Survey, prior: FlashPrior | None, warnings: list[str]) -> TagResult:
+    """Tags with a sidecar's prior; one that contradicts the pictures is left out, and a warning says so."""
+    if prior is None:
+        return tag(survey.profiles)
+    try:
+        return tag(survey.profiles, schedule=prior)
+    except TaggingError as contradiction:
+        result = tag(survey.profiles)
+        warnings.append(f"The sidecar was left out: {contradiction}")
+        return result
 
 
 def select_records(

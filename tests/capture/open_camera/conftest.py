@@ -1,6 +1,5 @@
 """A small film of a flat scene under a blinking flash, with a rolling shutter, for import tests."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,7 +8,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from capture.importers.options import ImportOptions
 from capture.transfer import to_display
 from capture.video import VideoWriter
 
@@ -77,9 +75,6 @@ class Film:
         return path
 
 
-FilmMaker = Callable[..., Path]
-
-
 @pytest.fixture(scope="session")
 def film() -> Film:
     """The film that most tests import."""
@@ -92,7 +87,9 @@ def video(film: Film, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return film.write(tmp_path_factory.mktemp("film") / "VID_20261102_101530.mp4", rotation_deg=90)
 
 
-@pytest.fixture
-def options() -> ImportOptions:
-    """Nothing asked for."""
-    return ImportOptions()
+@pytest.fixture(scope="session")
+def flash_list(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Says that frame 13 is lit and no other: spares the tagging where a test is about something else."""
+    path = tmp_path_factory.mktemp("list") / "flash.txt"
+    path.write_text("000013\n")
+    return path

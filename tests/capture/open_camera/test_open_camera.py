@@ -130,53 +130,63 @@ def test_ten_bit_hevc_is_kept_in_sixteen_bits(film, tmp_path: Path) -> None:
     assert 1 in flags(session)
 
 
-def test_a_late_start_is_kept(film, tmp_path: Path) -> None:
+def test_a_late_start_is_kept(film, flash_list: Path, tmp_path: Path) -> None:
     late = replace(film, seconds=3.0, start_s=0.35)
-    session = import_videos([late.write(tmp_path / "a.mp4")], tmp_path / "S", ImportOptions())
+    session = import_videos(
+        [late.write(tmp_path / "a.mp4")], tmp_path / "S", ImportOptions(flash_list=flash_list)
+    )
     assert session.frames[0].pts_s == pytest.approx(late.times_s()[0], abs=0.51 / 90_000)
 
 
-def test_missing_frames_are_remarked(film, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_frames_are_remarked(
+    film, flash_list: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     times, rows = film.times_s(), film.lit_rows()
     present = np.delete(np.arange(len(times)), [50, 51, 52])
     monkeypatch.setattr(type(film), "times_s", lambda self: times[present])
     monkeypatch.setattr(type(film), "lit_rows", lambda self: rows[present])
-    session = import_videos([film.write(tmp_path / "a.mp4")], tmp_path / "S", ImportOptions())
+    session = import_videos(
+        [film.write(tmp_path / "a.mp4")], tmp_path / "S", ImportOptions(flash_list=flash_list)
+    )
     assert [record.index for record in session.frames if "dropped_before" in record.reasons] == [50]
 
 
 # ---------------------------------------------------------------- colour
 
 
-def test_untagged_video_warns_in_the_session(film, tmp_path: Path) -> None:
+def test_untagged_video_warns_in_the_session(film, flash_list: Path, tmp_path: Path) -> None:
     untagged = {"color_range": None, "matrix": None, "transfer": None}
     video = replace(film, seconds=3.0).write(tmp_path / "a.mp4", **untagged)
-    session = import_videos([video], tmp_path / "S", ImportOptions())
+    session = import_videos([video], tmp_path / "S", ImportOptions(flash_list=flash_list))
     assert any("no matrix tag" in warning for warning in session.info["warnings"])
     assert session.info["source"]["matrix"] == "bt601"
 
 
-def test_the_users_transfer_beats_the_settings_and_these_the_tag(film, tmp_path: Path) -> None:
+def test_the_users_transfer_beats_the_settings_and_these_the_tag(
+    film, flash_list: Path, tmp_path: Path
+) -> None:
     video = replace(film, seconds=3.0, transfer="log:100@64").write(tmp_path / "a.mp4")
     (tmp_path / "BACKUP_OC_1.xml").write_text(
         '<open_camera_prefs><string key="preference_video_log" value="medium"/></open_camera_prefs>'
     )
-    session = import_videos([video], tmp_path / "S", ImportOptions())
+    session = import_videos([video], tmp_path / "S", ImportOptions(flash_list=flash_list))
     assert session.info["image"]["transfer"] == "log:100@64"
     assert session.info["source"]["transfer_tag"] == "rec709"
-    asked = import_videos([video], tmp_path / "T", ImportOptions(transfer="gamma:2.2"))
+    asked = import_videos([video], tmp_path / "T", ImportOptions(flash_list=flash_list, transfer="gamma:2.2"))
     assert asked.info["image"]["transfer"] == "gamma:2.2"
 
 
 # ---------------------------------------------------------------- several files
 
 
-def test_parts_are_joined_on_one_time_axis(film, tmp_path: Path) -> None:
+def test_parts_are_joined_on_one_time_axis(film, flash_list: Path, tmp_path: Path) -> None:
     first = replace(film, seconds=3.0)
     first.write(tmp_path / "VID_20261102_101530.mp4")
     second = replace(film, seconds=2.0, first_flash_s=film.first_flash_s + 3 * film.period_s - 3.0)
     second.write(tmp_path / "VID_20261102_101533.mp4")
-    session = import_source([tmp_path / "VID_20261102_101530.mp4"], tmp_path / "S", ImportOptions())
+    session = import_source(
+        [tmp_path / "VID_20261102_101530.mp4"], tmp_path / "S", ImportOptions(flash_list=flash_list)
+    )
     assert len(session.frames) == 150
     assert [entry["name"][-10:] for entry in session.info["source"]["files"]] == ["101530.mp4", "101533.mp4"]
     times = np.array([record.pts_s for record in session.frames])
@@ -191,19 +201,19 @@ def test_parts_are_joined_on_one_time_axis(film, tmp_path: Path) -> None:
 # ---------------------------------------------------------------- sidecars
 
 
-def test_where_it_was_filmed_is_left_out_unless_asked_for(film, tmp_path: Path) -> None:
+def test_where_it_was_filmed_is_left_out_unless_asked_for(film, flash_list: Path, tmp_path: Path) -> None:
     ended = datetime(2026, 11, 2, 9, 15, 33, tzinfo=UTC)
     video = replace(film, seconds=3.0).write(
         tmp_path / "VID_20261102_101530.mp4", location="+48.1371+011.5754/", creation_time=ended
     )
     video.with_suffix(".srt").write_text(SUBTITLES)
-    session = import_videos([video], tmp_path / "S", ImportOptions())
+    session = import_videos([video], tmp_path / "S", ImportOptions(flash_list=flash_list))
     text = session_text(session)
     assert not any(number in text for number in ("48.13", "11.57", "52.52", "13.40", "34.5"))
     assert session.info["source"]["started"] == "2026-11-02T10:15:30"
     assert session.info["source"]["started_text"] == "02.11.2026 10:15:30"
     assert session.info["source"]["ended_utc"] == "2026-11-02T09:15:33+00:00"
-    asked = import_videos([video], tmp_path / "T", ImportOptions(keep_location=True))
+    asked = import_videos([video], tmp_path / "T", ImportOptions(flash_list=flash_list, keep_location=True))
     assert asked.info["source"]["location"] == ["+48.1371+011.5754/", "52.5200, 13.4050, 34.5m"]
 
 
@@ -223,21 +233,34 @@ def test_clock_logs_give_frames_their_clock_and_the_tagger_a_prior(film, tmp_pat
     session = import_videos([video], tmp_path / "S", ImportOptions())
     clock = np.array([record.device_timestamp_ns for record in session.frames], float)
     np.testing.assert_allclose(clock, 81_234_567_890_123 + film.times_s() * 1e9, atol=1e3)
-    assert session.info["tagging"]["prior"] == "flash log"
+    prior = session.info["tagging"]["prior"]
+    assert prior["source"] == "flash log"
+    # What the log and the pictures differ by is the torch's latency; its pulses are matched one by one.
+    assert prior["offset_s"] == pytest.approx(0.020, abs=0.003)
+    assert prior["matched"] == len(flash_times)
     assert session.info["flash_schedule"]["on_s"] == 0.1
     assert all(found in (None, true) for found, true in zip(flags(session), film.labels(), strict=True))
 
 
-def test_logs_of_another_video_are_left_out_and_named(film, tmp_path: Path) -> None:
+def test_a_flash_log_that_contradicts_the_pictures_is_left_out_and_named(film, tmp_path: Path) -> None:
+    video = film.write(tmp_path / "VID_20261102_101530.mp4")
+    write_logs(video, film.times_s(), np.arange(0.1, 5.5, 0.37), 10**12)
+    session = import_videos([video], tmp_path / "S", ImportOptions())
+    assert session.info["tagging"]["prior"] is None
+    assert any("belongs to another recording" in warning for warning in session.info["warnings"])
+    assert all(found in (None, true) for found, true in zip(flags(session), film.labels(), strict=True))
+
+
+def test_logs_of_another_video_are_left_out_and_named(film, flash_list: Path, tmp_path: Path) -> None:
     video = film.write(tmp_path / "VID_20261102_101530.mp4")
     write_logs(video, np.arange(180) / 24.0, np.array([0.1]), 10**12)
     (tmp_path / "20261102_101530" / (video.stem + "_flash.csv")).unlink()
-    session = import_videos([video], tmp_path / "S", ImportOptions())
+    session = import_videos([video], tmp_path / "S", ImportOptions(flash_list=flash_list))
     assert session.frames[0].device_timestamp_ns is None
     assert any("contradict its own" in warning for warning in session.info["warnings"])
 
 
-def test_damaged_sidecars_do_not_stop_an_import(film, tmp_path: Path) -> None:
+def test_damaged_sidecars_do_not_stop_an_import(film, flash_list: Path, tmp_path: Path) -> None:
     video = replace(film, seconds=3.0).write(tmp_path / "VID_20261102_101530.mp4")
     for name in (
         f"{video.stem}.srt",
@@ -246,13 +269,15 @@ def test_damaged_sidecars_do_not_stop_an_import(film, tmp_path: Path) -> None:
         "BACKUP_OC_1.xml",
     ):
         (tmp_path / name).write_bytes(b"\xff\x00<garbage>")
-    session = import_videos([video], tmp_path / "S", ImportOptions())
+    session = import_videos([video], tmp_path / "S", ImportOptions(flash_list=flash_list))
     left_out = [warning for warning in session.info["warnings"] if "sidecar was left out" in warning]
     assert len(left_out) == 4
     assert session.info["source"]["sidecars"] == []
 
 
-def test_settings_that_harm_are_warned_of_and_the_exposure_is_recorded(film, tmp_path: Path) -> None:
+def test_settings_that_harm_are_warned_of_and_the_exposure_is_recorded(
+    film, flash_list: Path, tmp_path: Path
+) -> None:
     video = replace(film, seconds=3.0).write(tmp_path / "a.mp4")
     (tmp_path / "BACKUP_OC_1.xml").write_text(
         "<open_camera_prefs>"
@@ -260,17 +285,17 @@ def test_settings_that_harm_are_warned_of_and_the_exposure_is_recorded(film, tmp
         '<boolean key="preference_video_stabilization" value="true"/>'
         "</open_camera_prefs>"
     )
-    session = import_videos([video], tmp_path / "S", ImportOptions())
+    session = import_videos([video], tmp_path / "S", ImportOptions(flash_list=flash_list))
     assert any("stabilisation is on" in warning for warning in session.info["warnings"])
     assert {record.exposure_s for record in session.frames} == {0.005}
     assert session.info["device"]["iso"] == 400
 
 
-def test_subtitles_longer_than_the_video_are_warned_of(film, tmp_path: Path) -> None:
+def test_subtitles_longer_than_the_video_are_warned_of(film, flash_list: Path, tmp_path: Path) -> None:
     video = replace(film, seconds=3.0).write(tmp_path / "a.mp4")
     cue = "1\n00:00:{:02d},000 --> 00:00:{:02d},999\n10:15:30\n\n"
     video.with_suffix(".srt").write_text("".join(cue.format(k, k) for k in range(20)))
-    session = import_videos([video], tmp_path / "S", ImportOptions())
+    session = import_videos([video], tmp_path / "S", ImportOptions(flash_list=flash_list))
     assert any("do not belong together" in warning for warning in session.info["warnings"])
 
 
@@ -282,7 +307,7 @@ def test_a_flash_list_takes_the_place_of_tagging(film, video: Path, tmp_path: Pa
     (tmp_path / "flash.csv").write_text("\n".join(lines))
     session = import_videos([video], tmp_path / "S", ImportOptions(flash_list=tmp_path / "flash.csv"))
     assert flags(session) == film.labels()
-    assert "tagging" not in session.info
+    assert session.info["tagging"] is None
 
 
 # ---------------------------------------------------------------- where it is put
@@ -328,12 +353,14 @@ def test_an_interruption_before_the_writing_leaves_nothing(video: Path, tmp_path
     assert list(tmp_path.iterdir()) == []
 
 
-def test_progress_goes_from_nothing_to_all_in_every_stage(video: Path, tmp_path: Path) -> None:
+def test_progress_goes_from_nothing_to_all_in_every_stage(
+    video: Path, flash_list: Path, tmp_path: Path
+) -> None:
     told: dict[str, list[float]] = {}
     import_videos(
         [video],
         tmp_path / "S",
-        ImportOptions(),
+        ImportOptions(flash_list=flash_list),
         lambda stage, share: told.setdefault(stage, []).append(share),
     )
     assert list(told) == ["looking at every frame", "tagging", "writing frames"]
@@ -367,7 +394,7 @@ def test_a_video_of_three_frames_is_refused(film, tmp_path: Path) -> None:
 
 
 def test_of_a_file_that_is_cut_off_the_beginning_is_imported_and_the_loss_named(
-    video: Path, tmp_path: Path
+    video: Path, flash_list: Path, tmp_path: Path
 ) -> None:
     streamable = tmp_path / "streamable.mp4"
     with (
@@ -380,12 +407,14 @@ def test_of_a_file_that_is_cut_off_the_beginning_is_imported_and_the_loss_named(
                 packet.stream = stream
                 target.mux(packet)
     os.truncate(streamable, round(0.7 * streamable.stat().st_size))
-    session = import_videos([streamable], tmp_path / "S", ImportOptions())
+    session = import_videos([streamable], tmp_path / "S", ImportOptions(flash_list=flash_list))
     assert 60 < len(session.frames) < 180
     assert any("is cut off or damaged" in warning for warning in session.info["warnings"])
 
 
-def test_a_file_that_changes_between_the_passes_is_an_error(film, video: Path, tmp_path: Path) -> None:
+def test_a_file_that_changes_between_the_passes_is_an_error(
+    film, video: Path, flash_list: Path, tmp_path: Path
+) -> None:
     copy = tmp_path / "a.mp4"
     copy.write_bytes(video.read_bytes())
     other = replace(film, seconds=2.0).write(tmp_path / "b.mp4")
@@ -395,7 +424,7 @@ def test_a_file_that_changes_between_the_passes_is_an_error(film, video: Path, t
             copy.write_bytes(other.read_bytes())
 
     with pytest.raises(SourceError, match="changed while it was read"):
-        import_videos([copy], tmp_path / "S", ImportOptions(), exchange)
+        import_videos([copy], tmp_path / "S", ImportOptions(flash_list=flash_list), exchange)
     assert Session.open(tmp_path / "S").status == "interrupted"
 
 

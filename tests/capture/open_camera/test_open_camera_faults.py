@@ -36,7 +36,7 @@ def check_import(folder: Path) -> None:
     assert "\n" not in sentence
 
 
-@settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_a_damaged_video(data: st.DataObject, short_video: bytes, damage: Damage, scratch: Path) -> None:
     folder = scratch / "video"
@@ -46,7 +46,7 @@ def test_a_damaged_video(data: st.DataObject, short_video: bytes, damage: Damage
     check_import(folder)
 
 
-@settings(max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=8, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     frame_log=st.lists(st.integers(0, 2**64), max_size=40),
     flash_log=st.lists(st.integers(0, 2**64), max_size=5),
