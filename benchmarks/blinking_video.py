@@ -121,18 +121,10 @@ def make_truth(video: Video) -> Truth:
     for a, b in zip(on, off, strict=True):
         end = _lamp_integral(row_start + video.exposure_s, a, b, video)
         lit += (end - _lamp_integral(row_start, a, b, video)) / video.exposure_s
-    # A drooping lamp's plateau is "full" by definition: what matters is whether the whole exposure saw the lamp on.
-    seen = np.zeros_like(row_start)
-    for a, b in zip(on, off, strict=True):
-        first, last = a + video.rise_s, b
-        outer = np.minimum(row_start + video.exposure_s, b + video.fall_s) - np.maximum(row_start, a)
-        inner = np.minimum(row_start + video.exposure_s, last) - np.maximum(row_start, first)
-        whole = inner >= video.exposure_s * (1 - 1e-9)
-        plain = outer if video.rise_s == video.fall_s == 0 else np.where(whole, video.exposure_s, np.minimum(outer, 0.97 * video.exposure_s))
-        seen += np.clip(plain / video.exposure_s, 0, 1)
-    low, high = seen.min(axis=1), seen.max(axis=1)
+    # a drooping lamp is fully on at its lowest level
+    full = TRUTH_FULL * (1 - video.droop)
     labels = tuple(
-        1 if a >= TRUTH_FULL else 0 if b <= TRUTH_NONE else None for a, b in zip(low, high, strict=True)
+        1 if row.min() >= full else 0 if row.max() <= TRUTH_NONE else None for row in lit
     )
     return Truth(pts_s=start, lit=lit, on_s=on, off_s=off, labels=labels)
 

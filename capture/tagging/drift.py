@@ -16,6 +16,8 @@ Floats = NDArray[np.float64]
 
 #: Changes below the first are passed, above the second called a failure (shares of the light).
 WARN_SHARE, FAIL_SHARE = 0.01, 0.03
+# A slow drift must exceed its noise so far: a camera that pans to a brighter side looks like one.
+_DRIFT_SIGMAS = 5.0
 # Frames on each side of a suspected step: a switch takes one, an automatic exposure a few.
 _STEP_REACHES = (1, 3, 6)
 # A step must stand out of the noise of such differences by so much, and most blocks must take part in it.
@@ -71,7 +73,7 @@ class Drift:
             ("exposure", self.exposure_share, self.exposure_sigma),
             ("balance", self.balance_share, self.balance_sigma),
         ):
-            if share is not None and sigma is not None and abs(share) > max(WARN_SHARE, 3 * sigma) and not self.steps:
+            if share is not None and sigma is not None and abs(share) > max(WARN_SHARE, _DRIFT_SIGMAS * sigma) and not self.steps:
                 grade = "more than may be" if abs(share) > FAIL_SHARE else "a little"
                 out.append(
                     f"The {_WORDS[name]} of the frames without flash drifts by {100 * share:+.1f} % "

@@ -21,13 +21,12 @@ Floats = NDArray[np.float64]
 _DETUNING_HZ = 0.3
 # Waves per frame height: 33 ms of readout at 120 Hz is 4.
 _MOST_WAVES, _WAVE_STEP = 4.5, 0.1
-# Rows' mean over this time is taken out first: what the picture shows, and a wave that stands still, which does no harm.
-_WINDOW_S = 0.5
 # At the frame rate the light's frequency appears as an alias. One slower than this is followed by the unlit frames around a
 # pulse, so it does no harm; and a moving camera has its power there.
 _SLOWEST_ALIAS_HZ = 1.5
 # A wave counts when its amplitude is above this and so many times the usual one of the spectrum.
-_LEAST_DEPTH, _LEAST_RATIO = 0.004, 6.0
+_LEAST_DEPTH, _LEAST_RATIO = 0.004, 10.0
+_LEAST_FRAMES = 24
 # Amplitude and phase are followed at this scale.
 _FOLLOW_S = 0.6
 
@@ -48,6 +47,11 @@ class Flicker:
     readout_s: float
     row_gain: Floats
 
+    @property
+    def waves(self) -> float:
+        """Periods over the height of a frame."""
+        return self.readout_s * self.frequency_hz
+
 
 def find_flicker(
     pts_s: Floats, log_rows: Floats, steady: NDArray[np.bool_], rows: int, config: TaggingConfig
@@ -64,38 +68,51 @@ def find_flicker(
     Returns:
         The flicker; None when there is none above the noise, or too few frames.
     """
-    count, bands = log_rows.shape
-    if steady.sum() < 24:
-        return None
     interval = float(np.median(np.diff(pts_s)))
-    residual = _high_pass(log_rows, steady, max(3, round(_WINDOW_S / interval)))
+    best: tuple[float, Flicker] | None = None
+    for nominal_hz in config.mains_hz:
+        found = _find_near(nominal_hz, pts_s, log_rows, steady, rows, interval)
+        if found is not None and (best is None or found[0] > best[0]):
+            best = found
+    return None if best is None else best[1]
+
+
+def _find_near(
+    nominal_hz: float, pts_s: Floats, log_rows: Floats, steady: NDArray[np.bool_], rows: int, interval: float
+) -> tuple[float, Flicker] | None:
+    """Flicker near one frequency with its strength."""
+    bands = log_rows.shape[1]
+    alias_hz = abs((nominal_hz * interval + 0.5) % 1 - 0.5) / interval
+    if alias_hz < _SLOWEST_ALIAS_HZ:
+        return None
+    # The mean over one period of the alias has no flicker in it, and nearly all of the camera's motion.
+    window = max(3, 2 * round(0.5 / (alias_hz * interval) - 0.5) + 1)
+    steady = ndimage.binary_erosion(steady, np.ones(window), border_value=0)
+    if steady.sum() < _LEAST_FRAMES:
+        return None
+    residual = log_rows - ndimage.uniform_filter1d(log_rows, window, axis=0)
+    kept = 1 - np.sin(np.pi * alias_hz * interval * window) / (window * np.sin(np.pi * alias_hz * interval))
     used = residual[steady]
     scale = 1.4826 * float(np.median(np.abs(used))) + 1e-6
     used = np.clip(used, -3 * scale, 3 * scale) * np.hanning(bands + 2)[1:-1]
     position = (np.arange(bands) + 0.5) / bands
-    waves = np.arange(-_MOST_WAVES, _MOST_WAVES + _WAVE_STEP, _WAVE_STEP)
+    most = min(_MOST_WAVES, 1.05 * nominal_hz * interval)  # a readout is no longer than the frame interval
+    waves = np.arange(-most, most + _WAVE_STEP, _WAVE_STEP)
     over_rows = used @ np.exp(-2j * np.pi * position[:, None] * waves)  # [k, Q]
     time = pts_s[steady] - pts_s[steady][0]
     step = 0.5 / max(float(time[-1]), 1.0)
-    detuning = np.arange(-_DETUNING_HZ, _DETUNING_HZ + step, step)
-    best: tuple[float, float, float] | None = None
-    for nominal in config.mains_hz:
-        alias = np.abs((nominal * interval + 0.5) % 1 - 0.5) / interval
-        if alias < _SLOWEST_ALIAS_HZ:
-            continue
-        frequency = nominal + detuning
-        spectrum = np.abs(np.exp(-2j * np.pi * frequency[:, None] * time) @ over_rows) / len(time)
-        peak = np.unravel_index(int(np.argmax(spectrum)), spectrum.shape)
-        # Of a real series the mirrored wave has the same power: the one whose readout a sensor can have is meant.
-        if spectrum[peak] > _LEAST_RATIO * np.median(spectrum) and (best is None or spectrum[peak] > best[0]):
-            best = (float(spectrum[peak]), float(frequency[peak[0]]), float(waves[peak[1]]))
-    if best is None:
+    frequency = nominal_hz + np.arange(-_DETUNING_HZ, _DETUNING_HZ + step, step)
+    spectrum = np.abs(np.exp(-2j * np.pi * frequency[:, None] * time) @ over_rows) / len(time)
+    peak = np.unravel_index(int(np.argmax(spectrum)), spectrum.shape)
+    # Without a wave, the spectrum of noise has a Rayleigh distribution: as many cells as here hardly reach 4 medians.
+    ratio = float(spectrum[peak] / np.median(spectrum))
+    if ratio < _LEAST_RATIO:
         return None
-    _, frequency_hz, wave = best
-    gain, depth = _follow(pts_s, residual, steady, frequency_hz, wave, rows, interval)
-    if depth < _LEAST_DEPTH or abs(wave) > frequency_hz * 1.05 * interval:
+    frequency_hz, wave = float(frequency[peak[0]]), float(waves[peak[1]])
+    gain, depth = _follow(pts_s, residual / kept, steady, frequency_hz, wave, rows, interval)
+    if depth < _LEAST_DEPTH:
         return None
-    return Flicker(frequency_hz=frequency_hz, depth=depth, readout_s=wave / frequency_hz, row_gain=gain)
+    return ratio, Flicker(frequency_hz, depth, wave / frequency_hz, gain)
 
 
 def _follow(
@@ -116,12 +133,3 @@ def _follow(
 
 def _smooth(values: Floats, width: float) -> Floats:
     return np.asarray(ndimage.gaussian_filter1d(values, width, mode="nearest"), float)
-
-
-def _high_pass(log_rows: Floats, steady: NDArray[np.bool_], window: int) -> Floats:
-    """Rows less their mean over a moving window of steady frames."""
-    weight = steady.astype(float)[:, None]
-    size = window | 1
-    total = ndimage.uniform_filter1d(log_rows * weight, size, axis=0, mode="constant")
-    share = ndimage.uniform_filter1d(weight, size, axis=0, mode="constant")
-    return log_rows - total / np.maximum(share, 1e-9)

@@ -26,6 +26,8 @@ _SPANS = (0.15, 0.3, 0.5, 0.75, 1.0, 1.3)
 _ROLLS = (-0.9, -0.7, -0.4, 0.0, 0.4, 0.7, 0.9)
 # Factors on the span that are tried at the found roll: the evidence has several peaks along it.
 _STRETCHES = np.geomspace(0.45, 2.2, 24)
+# A hump of the evidence wider than this, in log span, is taken by its mean; it is one step of the stretches.
+_SHARP = 0.07
 # More pulses sharpen the coarse search, and the fit, no further.
 _FEW, _MOST = 8, 16
 # Bands that are made one here: their slopes stay resolved, and the cost is halved.
@@ -91,11 +93,12 @@ def fit_shutter(
     starts = [(np.log(span), roll) for span in _SPANS for roll in _ROLLS]
     best = max(starts, key=coarse.evidence)
     best = coarse.climb(best, 25)
-    stretched = [(best[0] + np.log(factor), best[1]) for factor in _STRETCHES]
-    best = max([best, *stretched], key=problem.evidence)
-    best = problem.climb(best, 30)
+    best, stretch = problem.stretch(best)
+    if stretch is None:
+        best = problem.climb(best, 30)
+        stretch = problem.sigma(best, 0)
+    roll = problem.sigma(best, 1)
     readout_s, exposure_s = problem.times(best)
-    stretch, roll = problem.sigma(best, 0), problem.sigma(best, 1)
     span = abs(readout_s) + exposure_s
     return Shutter(
         readout_s=readout_s,
@@ -171,6 +174,27 @@ class _Problem:
             options={"initial_simplex": simplex, "maxfev": evaluations, "xatol": 2e-3, "fatol": 0.05},
         )
         return float(found.x[0]), float(found.x[1])
+
+    def stretch(self, x: tuple[float, float]) -> tuple[tuple[float, float], float | None]:
+        """The best stretch of the span, and how well it is known; None when there is one sharp peak to climb.
+
+        Where the pulses are irregular the evidence is a wide hump, rough by what the edge search leaves: its mean and width
+        are the answer, not its highest point.
+        """
+        logs = x[0] + np.log(_STRETCHES)
+        evidence = np.array([self.evidence((value, x[1])) for value in logs])
+        possible = np.isfinite(evidence)
+        if not possible.any():
+            return x, None
+        evidence = np.where(possible, evidence, evidence[possible].min() - 20)
+        smooth = np.convolve(np.pad(evidence, 1, mode="edge"), [0.25, 0.5, 0.25], mode="valid")
+        weight = np.exp(smooth - smooth.max())
+        weight /= weight.sum()
+        mean = float(weight @ logs)
+        width = float(np.sqrt(weight @ np.square(logs - mean)))
+        if width > _SHARP:
+            return (mean, x[1]), width
+        return (float(logs[np.argmax(evidence)]), x[1]), None
 
     def sigma(self, x: tuple[float, float], axis: int) -> float:
         """Standard deviation along one parameter: the distance at which the evidence falls, taken for a normal's."""

@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from capture.errors import TaggingError
 from capture.tagging.bands import BandGains, band_gains
@@ -47,6 +48,8 @@ _LEAST_PULSES = 0.4
 # nothing in common. One pulse that does not fit the others, below the second, is another light.
 _AGREEMENT, _LEAST_AGREEMENT = 0.25, 0.1
 _PATTERN_BLOCKS = 8
+# A flicker with fewer waves over the rows does not measure the readout.
+_LEAST_WAVES = 0.7
 # A readout that is known no better than this share of the frame interval is not told.
 _KNOWN_SHARE = 0.25
 # Tails of the scores in the confidence of frames far from any pulse: motion's are heavy (Student-t).
@@ -117,7 +120,7 @@ def _split(profiles: FrameProfiles, config: TaggingConfig) -> tuple[Split, Flick
     square = blocks.reshape(len(profiles), BLOCKS, BANDS // BLOCKS, BLOCKS).mean(axis=2)
     split = split_frames(profiles.pts_s, square, config)
     if flicker is not None:  # again, from the frames that are unlit, for the rows of the thumbnails
-        unlit = split.score < 0.25
+        unlit = ~ndimage.binary_dilation(split.score > 0.25, iterations=2)
         flicker = find_flicker(profiles.pts_s, rows, unlit, THUMBNAIL_ROWS, config) or flicker
     return split, flicker, square
 
@@ -141,7 +144,7 @@ def _find_pulses(
     middle_s = np.array([0.5 * (pts_s[w.first] + pts_s[w.last]) for w in windows])
     coarse = fit_rhythm(middle_s, config)
     cycle = coarse.cycle if coarse is not None else np.full(len(windows), -1)
-    if flicker is not None and config.readout_s is None:
+    if flicker is not None and config.readout_s is None and abs(flicker.waves) > _LEAST_WAVES:
         config = replace(config, readout_s=flicker.readout_s)  # the wave over the rows measures it
     edges = edge_range(pts_s, windows, interval_s, config)
     shutter = fit_shutter(data, edges, cycle, gain_prior, interval_s, config)
