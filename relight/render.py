@@ -16,12 +16,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from capture.cameras import Camera
-from capture.images import write_exr, write_png
+from capture.images import decode_image, encode_image, write_exr, write_png
 from capture.transfer import to_display
 from capture.video.writer import VideoWriter
 from relight.lighting import CapturedLight, FlashLight, Light, RoomLight, SumLight, shade
@@ -167,15 +168,20 @@ def render_orbit(
     turns = (rotation_deg // 90) % 4
     width, height = (path[0].width, path[0].height) if turns % 2 == 0 else (path[0].height, path[0].width)
     # H.264 in the common 4:2:0 form has no odd sides.
+    half = len(path) // 2
+    outward: list[bytes] = []  # the way back is the way there; compressed, for a long orbit is gigabytes
     with VideoWriter(out, width // 2 * 2, height // 2 * 2) as video:
         for number, camera in enumerate(path):
-            view, radiances = renderer.view(camera, {"light": light}, 0)
-            if number == 0:
-                exposure = _exposure(light, radiances["light"], view.mask)
-            picture = np.rot90(display_picture(radiances["light"], view.mask, exposure), -turns)
-            video.write(
-                np.ascontiguousarray(picture[: height // 2 * 2, : width // 2 * 2]), number / _ORBIT_HZ
-            )
+            if number <= half:
+                view, radiances = renderer.view(camera, {"light": light}, 0)
+                if number == 0:
+                    exposure = _exposure(light, radiances["light"], view.mask)
+                picture = np.rot90(display_picture(radiances["light"], view.mask, exposure), -turns)
+                picture = np.ascontiguousarray(picture[: height // 2 * 2, : width // 2 * 2])
+                outward.append(encode_image(picture, ".png", [cv2.IMWRITE_PNG_COMPRESSION, 1]))
+            else:
+                picture = decode_image(outward[len(path) - number], out)
+            video.write(picture, number / _ORBIT_HZ)
             progress("orbit", (number + 1) / len(path))
 
 
