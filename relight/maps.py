@@ -10,6 +10,7 @@ filled too.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import cv2
@@ -24,7 +25,9 @@ from relight.raster import IdPyramid, rasterize_ids
 
 _WIDTH = 0.5  # of a splat, standard deviation in spacings of the points on the screen
 _NARROWEST_PX = 0.35  # below this a splat between two pixel centres would reach neither
-_COVERED = 0.05  # sum of weights that makes a pixel covered: a point about one and a half pixels away
+_COVERED = 0.05  # sum of weights with which a pixel has a value of its own: a point 1.5 pixels away
+_INSIDE = 0.4  # of the sum of weights on an even surface; at its edge the sum is half of it, less some gaps
+_TRACE = 1e-3  # of coverage, beyond the outline: if that errs by a pixel there are values nevertheless
 _GRAZING = 0.02  # cosine under which a point does not face the view
 _CELL, _TOLERANCE = 2.4, 5.0  # of the visibility test, in spacings: finer than for observing, edges show
 _ENCLOSED_SHARE = 0.01  # of the mask: larger enclosed gaps are the subject's, e.g. under a bent arm
@@ -40,7 +43,8 @@ class Maps:
         normals_world: [H, W, 3] unit.
         room_radiance: [H, W, 3] linear radiance under the room's light.
         shading: [H, W] room shading s, 0..1.
-        mask: [H, W] 0..1 coverage; the other maps are not premultiplied by it.
+        mask: [H, W] 0..1 coverage, at least a thousandth wherever there are values; the other maps are not
+            premultiplied by it.
         depth: [H, W] z along the optical axis, world units.
         points_world: [H, W, 3] world.
         confidence: [H, W] 0..1.
@@ -90,12 +94,15 @@ def render_maps(portrait: Portrait, camera: Camera) -> Maps:
         ],
         dim=1,
     )
-    spread_px = (_WIDTH * portrait.spacing * float(camera.K[0, 0]) / z.clamp(min=1e-9)).clamp(
-        min=_NARROWEST_PX
-    )
-    sums = _splat(values, uv_px[seen], spread_px, cosine[seen].clamp(min=0.1), height, width)
-    mask = _soft_mask((sums[-1] > _COVERED).cpu().numpy()).to(sums)
-    support = mask > 0
+    natural_px = _WIDTH * portrait.spacing * float(camera.K[0, 0]) / z.clamp(min=1e-9)
+    spread_px = natural_px.clamp(min=_NARROWEST_PX)
+    # Slanted surfaces have more points a pixel, and splats that are kept from being too narrow overlap more:
+    # with these weights the sum is the same, 2 pi _WIDTH^2, on all of the surface.
+    weight = cosine[seen].clamp(min=0.1) * (natural_px / spread_px) ** 2
+    sums = _splat(values, uv_px[seen], spread_px, weight, height, width)
+    inside = sums[-1] > _INSIDE * 2.0 * math.pi * _WIDTH**2
+    support = _soft_mask((sums[-1] > _COVERED).cpu().numpy()).to(sums) > 0
+    mask = torch.where(support, _soft_mask(inside.cpu().numpy()).to(sums).clamp(min=_TRACE), 0.0)
     filled = torch.where(support, pull_push(sums, _COVERED), 0.0).permute(1, 2, 0)
     normals = filled[..., :3]
     depth = filled[..., 12]
