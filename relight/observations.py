@@ -97,6 +97,7 @@ def visible_points(
     *,
     cell: float = 4.8,
     tolerance: float = 7.5,
+    margin: bool = True,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Where points project and how they face a camera that sees them.
 
@@ -107,6 +108,8 @@ def visible_points(
         spacing: Of the points, world units.
         cell: Width of a z-buffer cell in spacings, and at least two pixels. With 4.8 some twenty points
             fall into a cell and none is empty; smaller ones resolve finer occluders.
+        margin: Whether what is nearer in a neighbouring cell hides a point too. Without, nothing near an
+            outline is hidden wrongly, but what lies behind may show between the nearer surface's points.
         tolerance: Depth in spacings that does not hide: the noise of a dense cloud stays within 7.5.
 
     Returns:
@@ -127,7 +130,8 @@ def visible_points(
     place = v * columns + u
     nearest = z.new_full((rows * columns,), torch.inf)
     nearest.scatter_reduce_(0, place[inside], z[inside], "amin")
-    nearest = -torch.nn.functional.max_pool2d(-nearest.view(1, 1, rows, columns), 3, 1, 1).flatten()
+    if margin:
+        nearest = -torch.nn.functional.max_pool2d(-nearest.view(1, 1, rows, columns), 3, 1, 1).flatten()
     towards = torch.as_tensor(camera.centre_world).to(points) - points
     length = (towards * towards).sum(dim=1).sqrt()
     cosine = (normals * towards).sum(dim=1) / length.clamp(min=1e-12)
