@@ -19,7 +19,7 @@ EXAMPLE = "relight demo --out demo --seed 3"
 
 _MARKER = ".relight-demo"
 _MARKER_TEXT = "Made by `relight demo`, which replaces this folder when it runs again.\n"
-_ORBIT_S = 4.0
+_ORBIT_S, _ORBIT_SCALE = 3.0, 0.75
 
 
 class DemoError(RelightError):
@@ -90,19 +90,17 @@ def prepare_folder(out: Path) -> None:
 def _render(session: Session, folder: Path, filmed: Path, out: Path, progress: Progress) -> None:
     """The rig's measured lights in two of its validation views, and an orbit under the studio's."""
     from capture.cameras import load_posed_set
-    from relight.commands.render import render_orbits
+    from relight.commands.render import upright_cameras
     from relight.light_spec import load_lights
     from relight.portrait import load_portrait
-    from relight.render import render_files
+    from relight.render import render_files, render_orbit
 
     portrait = load_portrait(folder)
     lights = load_lights(filmed / "lights.json")
     cameras = [frame.camera for frame in load_posed_set(filmed / "cameras_val.json").frames]
     render_files(portrait, cameras[::4], lights, out / "pictures", maps=True, progress=progress)
-    name = "env1"
-    render_orbits(
-        session, portrait, {name: lights[name]}, {name: out / "orbit.mp4"}, _ORBIT_S, True, progress
-    )
+    around = [camera.scaled(_ORBIT_SCALE) for camera in upright_cameras(session)]
+    render_orbit(portrait, around, lights["env1"], out / "orbit.mp4", seconds=_ORBIT_S, progress=progress)
 
 
 def _write_sheet(previews: Path, file: Path) -> None:

@@ -88,7 +88,7 @@ def run(args: argparse.Namespace) -> None:
     with StageProgress() as progress:
         if is_video or args.orbit:
             videos = {light: args.out if is_video else args.out / f"orbit.{light}.mp4" for light in lights}
-            render_orbits(session, portrait, lights, videos, args.seconds, not args.no_shadows, progress)
+            _orbits(portrait, upright_cameras(session), lights, videos, args, progress)
             said = "\n".join(str(video) for video in videos.values())
         else:
             cameras = _cameras(session, args.cameras)
@@ -96,25 +96,34 @@ def run(args: argparse.Namespace) -> None:
     print(said)
 
 
-def render_orbits(
-    session: Session,
-    portrait: Portrait,
-    lights: Mapping[str, Light],
-    videos: Mapping[str, Path],
-    seconds: float,
-    shadows: bool,
-    progress: Progress,
-) -> None:
-    """An upright video around the head for each light, under the light's name in `videos`."""
-    from relight.render import render_orbit
+def upright_cameras(session: Session) -> list[Camera]:
+    """The captured cameras as people look at their pictures, for an orbit."""
     from relight.upright import upright_camera
 
     rotation_deg = session.info["image"]["rotation_deg"]
-    cameras = [upright_camera(camera, rotation_deg) for camera in session.load_scene_cameras().values()]
+    return [upright_camera(camera, rotation_deg) for camera in session.load_scene_cameras().values()]
+
+
+def _orbits(
+    portrait: Portrait,
+    cameras: Sequence[Camera],
+    lights: Mapping[str, Light],
+    videos: Mapping[str, Path],
+    args: argparse.Namespace,
+    progress: Progress,
+) -> None:
+    from relight.render import render_orbit
+
     for name, light in lights.items():
         videos[name].parent.mkdir(parents=True, exist_ok=True)
         render_orbit(
-            portrait, cameras, light, videos[name], seconds=seconds, shadows=shadows, progress=progress
+            portrait,
+            cameras,
+            light,
+            videos[name],
+            seconds=args.seconds,
+            shadows=not args.no_shadows,
+            progress=progress,
         )
 
 
