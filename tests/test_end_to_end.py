@@ -7,6 +7,7 @@ import av
 import numpy as np
 import pytest
 
+from capture.cameras import load_posed_set
 from capture.images import read_exr, read_image
 from capture.ply import read_ply
 from capture.session import Session
@@ -86,7 +87,7 @@ def test_views_and_lights_become_the_files_that_other_tools_read(film, session, 
     argv += ["--lights", str(film / "lights.json"), "--maps", "--out", str(out)]
     assert main(argv) == 0
     lights = [light["name"] for light in json.loads((film / "lights.json").read_text())["lights"]]
-    names = [frame["name"] for frame in json.loads((film / "cameras_val.json").read_text())["frames"]]
+    names = [frame.camera.name for frame in load_posed_set(film / "cameras_val.json").frames]
     maps = ["albedo", "normal", "shading", "mask", "depth"]
     expected = {f"{name}.{layer}.exr" for name in names for layer in maps + lights}
     expected |= {f"{name}.{light}.png" for name in names for light in lights}
