@@ -35,7 +35,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     Args:
         argv: Arguments without the program; those of the process when None.
     """
-    # Threads of torch that wait by spinning slow a machine that does anything else down many times. Read once,
+    # Threads of torch that wait by spinning slow a machine that does other things down many times. Read once,
     # when torch is imported: before any command is.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     arguments = list(sys.argv[1:] if argv is None else argv)
