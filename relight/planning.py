@@ -35,9 +35,10 @@ Narrowing = tuple[Decision, dict[int, str]]
 
 _SAMPLED_FRAMES = 5  # of each kind, for the dark-room test: their mean is known to well under DARK_ROOM
 
-# Seconds on two cores, measured on a capture of 85 frames of 512 x 512 pixels (docs/results.md).
-_SECONDS_PER_POINT_AND_FRAME = 0.9e-6
-_SECONDS_PER_FRAME_PIXEL = 2.5e-7
+# Seconds on two idle cores, in round numbers: solve and pictures, the cloud, and each frame.
+_SECONDS = 8.0
+_SECONDS_PER_POINT = 3e-5
+_SECONDS_PER_FRAME = 0.08
 
 
 def make_plan(
@@ -273,5 +274,4 @@ def _evenly(records: list[FrameRecord], count: int) -> list[FrameRecord]:
 
 def _estimated_s(fitted: list[FrameRecord], cloud: PointCloud | None) -> float:
     points = 0 if cloud is None else len(cloud.points)
-    pixels = sum(record.width * record.height for record in fitted)
-    return points * len(fitted) * _SECONDS_PER_POINT_AND_FRAME + pixels * _SECONDS_PER_FRAME_PIXEL
+    return _SECONDS + _SECONDS_PER_POINT * points + _SECONDS_PER_FRAME * len(fitted)
