@@ -21,10 +21,11 @@ from numpy.typing import NDArray
 from capture.cameras import Camera
 from relight.observations import visible_points
 from relight.portrait import Portrait
-from relight.raster import IdPyramid, rasterize_ids
+from relight.raster import NEAR_M, IdPyramid, project, rasterize_ids
 
 _WIDTH = 0.5  # of a splat, standard deviation in spacings of the points on the screen
 _NARROWEST_PX = 0.35  # below this a splat between two pixel centres would reach neither
+_WIDEST_PX = 2.5  # points further apart leave gaps between their 3x3 pixels: such views are drawn smaller
 _COVERED = 0.05  # sum of weights with which a pixel has a value of its own: a point 1.5 pixels away
 _INSIDE = 0.4  # of the sum of weights on an even surface; at its edge the sum is half of it, less some gaps
 _TRACE = 1e-3  # of coverage, beyond the outline: if that errs by a pixel there are values nevertheless
@@ -74,12 +75,47 @@ def render_maps(portrait: Portrait, camera: Camera) -> Maps:
     Returns:
         Maps of the camera's size, all zero where no point is seen.
     """
-    height, width = camera.height, camera.width
-    uv_px, cosine, _ = visible_points(
-        portrait.points, portrait.normals_world, camera, portrait.spacing, cell=_CELL, tolerance=_TOLERANCE
+    drawn = camera.scaled(_drawn_share(portrait, camera))
+    values, mask, point_ids = _draw(portrait, drawn)
+    if (drawn.width, drawn.height) != (camera.width, camera.height):
+        values, mask, point_ids = _enlarged(values, mask, point_ids, camera)
+    support = (mask > 0)[..., None]
+    values = torch.where(support, values, 0.0)
+    normals, depth = values[..., :3], values[..., 12]
+    return Maps(
+        albedo=values[..., 3:6].clamp(min=0.0),
+        normals_world=normals / torch.linalg.vector_norm(normals, dim=-1, keepdim=True).clamp(min=1e-12),
+        room_radiance=values[..., 6:9].clamp(min=0.0),
+        shading=values[..., 9].clamp(0.0, 1.0),
+        mask=mask,
+        depth=depth,
+        points_world=torch.where(support, _unproject(depth, camera), 0.0),
+        confidence=values[..., 10].clamp(0.0, 1.0),
+        gloss=values[..., 11].clamp(min=0.0),
+        point_ids=point_ids,
     )
-    seen = (cosine > _GRAZING).nonzero()[:, 0]
-    points = portrait.points[seen]
+
+
+def _drawn_share(portrait: Portrait, camera: Camera) -> float:
+    """Size, relative to the camera's, at which the points are not too far apart for their splats."""
+    sample = portrait.points[:: max(1, len(portrait.points) // 5_000)]
+    uv_px, z = project(sample, camera)
+    seen = (z > NEAR_M) & (uv_px >= 0).all(dim=1)
+    seen &= (uv_px[:, 0] < camera.width) & (uv_px[:, 1] < camera.height)
+    if not bool(seen.any()):
+        return 1.0
+    return min(1.0, _WIDEST_PX * float(z[seen].median()) / (portrait.spacing * float(camera.K[0, 0])))
+
+
+def _draw(portrait: Portrait, camera: Camera) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Values [H, W, 13], mask [H, W] and point ids [H, W] of a view."""
+    height, width = camera.height, camera.width
+    surface = portrait.points, portrait.normals_world, camera, portrait.spacing
+    uv_px, cosine, _ = visible_points(*surface, cell=_CELL, tolerance=_TOLERANCE)
+    _, behind, _ = visible_points(*surface, cell=_CELL, tolerance=_TOLERANCE, margin=False)
+    surely = cosine > _GRAZING
+    seen = (surely | (behind > _GRAZING)).nonzero()[:, 0]
+    points, cosine, surely = portrait.points[seen], torch.maximum(cosine, behind)[seen], surely[seen]
     rotation = torch.as_tensor(camera.cam_from_world).to(points)
     z = points @ rotation[2, :3] + rotation[2, 3]
     values = torch.cat(
@@ -96,27 +132,38 @@ def render_maps(portrait: Portrait, camera: Camera) -> Maps:
     )
     natural_px = _WIDTH * portrait.spacing * float(camera.K[0, 0]) / z.clamp(min=1e-9)
     spread_px = natural_px.clamp(min=_NARROWEST_PX)
-    # Slanted surfaces have more points a pixel, and splats that are kept from being too narrow overlap more:
-    # with these weights the sum is the same, 2 pi _WIDTH^2, on all of the surface.
-    weight = cosine[seen].clamp(min=0.1) * (natural_px / spread_px) ** 2
-    sums = _splat(values, uv_px[seen], spread_px, weight, height, width)
+    # Slanted surfaces have more points a pixel, splats that are kept from being too narrow overlap more, and of
+    # wide ones a part lies outside of 3x3 pixels: with these weights the sum is 2 pi _WIDTH^2 everywhere.
+    weight = cosine.clamp(min=0.1) * (natural_px / spread_px) ** 2
+    weight = weight / torch.erf(1.5 / math.sqrt(2.0) / spread_px) ** 2
+    uv_px = uv_px[seen]
+    sums, rest = (
+        _splat(values[part], uv_px[part], spread_px[part], weight[part], height, width)
+        for part in (surely, ~surely)
+    )
+    # Close behind an outline, as of the chin before the neck, only the points without a margin reach.
+    sums = torch.where(sums[-1] > _COVERED, sums, sums + rest)
     inside = sums[-1] > _INSIDE * 2.0 * math.pi * _WIDTH**2
     support = _soft_mask((sums[-1] > _COVERED).cpu().numpy()).to(sums) > 0
     mask = torch.where(support, _soft_mask(inside.cpu().numpy()).to(sums).clamp(min=_TRACE), 0.0)
-    filled = torch.where(support, pull_push(sums, _COVERED), 0.0).permute(1, 2, 0)
-    normals = filled[..., :3]
-    depth = filled[..., 12]
-    return Maps(
-        albedo=filled[..., 3:6].clamp(min=0.0),
-        normals_world=normals / torch.linalg.vector_norm(normals, dim=-1, keepdim=True).clamp(min=1e-12),
-        room_radiance=filled[..., 6:9].clamp(min=0.0),
-        shading=filled[..., 9].clamp(0.0, 1.0),
-        mask=mask,
-        depth=depth,
-        points_world=torch.where(support[..., None], _unproject(depth, camera), 0.0),
-        confidence=filled[..., 10].clamp(0.0, 1.0),
-        gloss=filled[..., 11].clamp(min=0.0),
-        point_ids=_point_ids(rasterize_ids(points, camera, _ID_LEVELS), seen, support),
+    ids = _point_ids(rasterize_ids(points, camera, _ID_LEVELS), seen, support)
+    return pull_push(sums, _COVERED).permute(1, 2, 0), mask, ids
+
+
+def _enlarged(
+    values: torch.Tensor, mask: torch.Tensor, ids: torch.Tensor, camera: Camera
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """What was drawn smaller, at a camera's size."""
+
+    def resized(image: torch.Tensor, mode: str) -> torch.Tensor:
+        return torch.nn.functional.interpolate(image[None], size=(camera.height, camera.width), mode=mode)[0]
+
+    mask = resized(mask[None], "bilinear")[0]
+    ids = resized(ids[None].double(), "nearest-exact")[0].long()  # float64 holds every id
+    return (
+        resized(values.permute(2, 0, 1), "bilinear").permute(1, 2, 0),
+        mask,
+        torch.where(mask > 0, ids, -1),
     )
 
 
