@@ -132,8 +132,8 @@ def _draw(portrait: Portrait, camera: Camera) -> tuple[torch.Tensor, torch.Tenso
     )
     natural_px = _WIDTH * portrait.spacing * float(camera.K[0, 0]) / z.clamp(min=1e-9)
     spread_px = natural_px.clamp(min=_NARROWEST_PX)
-    # Slanted surfaces have more points a pixel, splats that are kept from being too narrow overlap more, and of
-    # wide ones a part lies outside of 3x3 pixels: with these weights the sum is 2 pi _WIDTH^2 everywhere.
+    # Slanted surfaces have more points a pixel, splats that are kept from being too narrow overlap more, and
+    # of wide ones a part lies outside of 3x3 pixels: with these weights the sum is 2 pi _WIDTH^2 everywhere.
     weight = cosine.clamp(min=0.1) * (natural_px / spread_px) ** 2
     weight = weight / torch.erf(1.5 / math.sqrt(2.0) / spread_px) ** 2
     uv_px = uv_px[seen]
