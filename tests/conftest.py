@@ -9,6 +9,6 @@ from hypothesis import settings
 for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"):
     os.environ.setdefault(variable, "1")
 
-# A failure must be the same on every machine and every run; speed is measured in benchmarks, not by deadlines.
+# A failure must be the same on every machine and every run; speed is for benchmarks, not for deadlines.
 settings.register_profile("fixed", derandomize=True, deadline=None)
 settings.load_profile("fixed")
