@@ -4,7 +4,7 @@
     python -m benchmarks.import_video --video VID_20261102_101530.mp4 --out result.json
 
 Without --video a clip of 20 s, 1920 x 1080, 30 fps, H.264 at 17 Mbit/s is made first: a textured scene that
-sways as in a hand, noise, a rolling shutter of 20 ms, exposure 5 ms, a flash of 100 ms every 1.003 s.
+sways as in a hand, noise, a rolling shutter of 20 ms, exposure 5 ms, a flash of 107 ms every 1.003 s.
 Decoding and import take turns, each in a process of its own, so that the peak memory is theirs alone. CPU
 seconds are given beside wall time, because they depend less on what else the machine does.
 """
@@ -12,18 +12,10 @@ seconds are given beside wall time, because they depend less on what else the ma
 from __future__ import annotations
 
 import argparse
-import json
 import multiprocessing
-import os
-import platform
-import resource
-import statistics
-import subprocess
 import tempfile
 import time
 from collections.abc import Callable
-from datetime import UTC, datetime
-from importlib.metadata import version
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -32,12 +24,14 @@ import av
 import cv2
 import numpy as np
 
+from benchmarks.record import spread, write_record
 from capture.importers.open_camera import import_videos
 from capture.importers.options import ImportOptions
 from capture.video import VideoWriter
 
-READOUT_S, EXPOSURE_S, PERIOD_S, ON_S, FIRST_S = 0.020, 0.005, 1.003, 0.100, 0.02
+READOUT_S, EXPOSURE_S, PERIOD_S, ON_S, FIRST_S = 0.020, 0.005, 1.003, 0.107, 0.02
 WIDTH, HEIGHT, RATE_HZ, BITS_PER_S = 1920, 1080, 30, 17_000_000
+PACKAGES = ("av", "numpy", "opencv-contrib-python-headless")
 DECODING, LOOKING, TAGGING, WRITING = "decoding", "looking at every frame", "tagging", "writing frames"
 
 
@@ -131,37 +125,14 @@ def _measure(work: Callable[[Path, Path], dict[str, Any]], video: Path, sender: 
 
 
 def _peak_mib() -> float:
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    """Peak resident memory of this process; unlike getrusage's it does not start at the parent's."""
+    lines = Path("/proc/self/status").read_text(encoding="utf-8").splitlines()
+    return next(int(line.split()[1]) / 1024 for line in lines if line.startswith("VmHWM"))
 
 
-def summary(runs: list[dict[str, Any]], key: str) -> dict[str, float]:
-    """Median and spread of a number over the runs."""
-    values = [run[key] for run in runs]
-    return {"median": statistics.median(values), "min": min(values), "max": max(values)}
-
-
-def machine() -> dict[str, Any]:
-    """Where and with what the numbers were made."""
-    cpu = next(
-        (
-            line.split(":")[1].strip()
-            for line in Path("/proc/cpuinfo").read_text().splitlines()
-            if "model name" in line
-        ),
-        platform.processor(),
-    )
-    commit = subprocess.run(
-        ["git", "rev-parse", "HEAD"], capture_output=True, text=True, check=False
-    ).stdout.strip()
-    return {
-        "commit": commit,
-        "date": datetime.now(UTC).isoformat(timespec="seconds"),
-        "cpu": cpu,
-        "cores": os.cpu_count(),
-        "load_average": os.getloadavg(),
-        "python": platform.python_version(),
-        "versions": {name: version(name) for name in ("av", "numpy", "opencv-contrib-python-headless")},
-    }
+def _summary(runs: list[dict[str, Any]], keys: tuple[str, ...]) -> dict[str, dict[str, float]]:
+    """Median, least and most of numbers over the runs."""
+    return {key: spread([run[key] for run in runs]) for key in keys}
 
 
 def main() -> None:
@@ -185,41 +156,38 @@ def main() -> None:
             imports.append(measured(import_once, video))
         size = video.stat().st_size
     last = imports[-1]
-    looking = [run["stages"][LOOKING] for run in imports]
-    tagging = [run["stages"][TAGGING] for run in imports]
-    ratios = {
-        f"{LOOKING} + {TAGGING} over {DECODING}, {kind}": statistics.median(
-            (a[kind] + b[kind]) / c[kind] for a, b, c in zip(looking, tagging, decodings, strict=True)
-        )
-        for kind in ("wall_s", "cpu_s")
-    }
-    result = {
-        "machine": machine(),
+    stages = {name: [run["stages"][name] for run in imports] for name in (LOOKING, TAGGING, WRITING)}
+    times = ("wall_s", "cpu_s")
+    results: dict[str, Any] = {
         "note": args.note,
         "video": {"bytes": size, "frames": last["frames"], "made": args.video is None},
-        DECODING: {key: summary(decodings, key) for key in ("wall_s", "cpu_s", "peak_mib")},
-        "import": {key: summary(imports, key) for key in ("wall_s", "cpu_s", "peak_mib", "peak_before_mib")},
-        "stages": {
-            name: {
-                kind: summary([run["stages"][name] for run in imports], kind) for kind in ("wall_s", "cpu_s")
-            }
-            for name in (LOOKING, TAGGING, WRITING)
+        DECODING: _summary(decodings, (*times, "peak_mib")),
+        "import": _summary(imports, (*times, "peak_mib", "peak_before_mib")),
+        "stages": {name: _summary(runs, times) for name, runs in stages.items()},
+        "looking and tagging over decoding": {
+            kind: spread(
+                [
+                    (looking[kind] + tagging[kind]) / decoding[kind]
+                    for looking, tagging, decoding in zip(
+                        stages[LOOKING], stages[TAGGING], decodings, strict=True
+                    )
+                ]
+            )
+            for kind in times
         },
-        "ratios": ratios,
         "found": {key: last[key] for key in ("kept", "lit", "partial", "readout_s", "period_s", "warnings")},
     }
     if args.video is None:
         true = pulse_starts_s(args.seconds)
-        error = [float(np.abs(np.array(last["pulses_on_s"]) - on_s).min()) for on_s in true]
-        result["pulses"] = {
+        error_s = np.array([np.abs(np.array(last["pulses_on_s"]) - on_s).min() for on_s in true])
+        results["pulses"] = {
             "true": len(true),
-            "found within 10 ms": int(np.sum(np.array(error) < 0.010)),
+            "found_within_10_ms": int(np.sum(error_s < 0.010)),
             "extra": len(last["pulses_on_s"]) - len(true),
-            "median error s": statistics.median(error),
+            "median_error_s": float(np.median(error_s)),
         }
-    args.out.parent.mkdir(parents=True, exist_ok=True)
-    args.out.write_text(json.dumps(result, indent=2) + "\n")
-    print(json.dumps(result, indent=2))
+    write_record(args.out, "import_video", PACKAGES, results)
+    print(args.out.read_text(encoding="utf-8"))
 
 
 if __name__ == "__main__":

@@ -14,9 +14,10 @@ from capture.importers.recording_parts import Recording
 from capture.selection import measure_sharpness
 from capture.tagging import FrameProfiles, ProfileAccumulator
 from capture.video import decode_video
-from capture.video.colour import Pixels, full_scale_planes, luma_levels
+from capture.video.colour import full_scale_planes, luma_levels
 
-_SHARPNESS_SIDE = 480  # the plane on which sharpness is measured has at least so many rows and columns
+# Tagging and sharpness look at a plane of at least so many rows and columns, averaged once for both.
+_SMALL_SIDE = 480
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,9 +63,10 @@ def survey_recording(recording: Recording, transfer: str, progress: Progress) ->
         SourceError: no undamaged frame.
     """
     first = recording.parts[0].video
+    width, height = _small_size(first.width, first.height)
     accumulator = ProfileAccumulator(
-        first.width,
-        first.height,
+        width,
+        height,
         transfer=transfer,
         levels=luma_levels(first.colour, first.bits),
         matrix=first.colour.matrix,
@@ -82,17 +84,18 @@ def survey_recording(recording: Recording, transfer: str, progress: Progress) ->
             )
         for frame in decode_video(part.video, problems):
             pts_s = shift_s + frame.pts_s
-            luma, *chroma = full_scale_planes(frame.picture)
+            luma, blue, red = full_scale_planes(frame.picture)
+            small = cv2.resize(luma, (width, height), interpolation=cv2.INTER_AREA)
             if not frame.damaged:
-                accumulator.add(luma, pts_s, chroma=(chroma[0], chroma[1]))
-            frames.append(SeenFrame(number, pts_s, _sharpness(luma), frame.damaged))
+                accumulator.add(small, pts_s, chroma=(blue, red))
+            frames.append(SeenFrame(number, pts_s, measure_sharpness(small), frame.damaged))
             progress("looking at every frame", min(pts_s / max(end_s, 1e-9), 1.0))
     if all(frame.damaged for frame in frames):
         raise SourceError(f"{first.path} holds no undamaged frame; copy it again from the phone.")
     return Survey(frames, accumulator.profiles(), problems)
 
 
-def _sharpness(luma: Pixels) -> float:
-    factor = max(1, min(luma.shape) // _SHARPNESS_SIDE)
-    size = (luma.shape[1] // factor, luma.shape[0] // factor)
-    return measure_sharpness(luma if factor == 1 else cv2.resize(luma, size, interpolation=cv2.INTER_AREA))
+def _small_size(width: int, height: int) -> tuple[int, int]:
+    """Size of the plane that is looked at: a whole fraction of the picture."""
+    factor = max(1, min(width, height) // _SMALL_SIDE)
+    return width // factor, height // factor
