@@ -12,6 +12,7 @@ Frames are numbered through all parts of the capture, kept or not. Nothing is wr
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -57,10 +58,9 @@ def import_videos(
     """
     progress = progress or no_progress
     out = Path(out)
+    _check_options(options)
     recording = open_recording([Path(source) for source in sources], join_split=join_split)
     video = recording.parts[0].video
-    if options.masks is not None:
-        raise SourceError("--masks is for image sets; give a video's masks to the session after the import.")
     scene = read_video_scene(options, video)
     evidence = gather_evidence(recording)
     source = _describe_source(recording, evidence, options)
@@ -99,7 +99,21 @@ def import_videos(
         write_frames(session, recording, records, progress)
         kept = [record.index for record in records if record.file is not None]
         save_video_scene(scene, posed, kept, session)
+        session.finish()
     return session
+
+
+def _check_options(options: ImportOptions) -> None:
+    if options.masks is not None:
+        raise SourceError("--masks is for image sets; give a video's masks to the session after the import.")
+    if not 0 < options.kept_rate_hz < math.inf:
+        raise SourceError(
+            f"{options.kept_rate_hz:g} frames a second cannot be kept; give a positive --rate, as 6."
+        )
+    if options.max_frames is not None and options.max_frames < 2:
+        raise SourceError(
+            f"At most {options.max_frames} frames are too few; one lit and one unlit are needed."
+        )
 
 
 def _open_interrupted(out: Path, source: dict[str, Any]) -> Session | None:

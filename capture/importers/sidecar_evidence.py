@@ -107,22 +107,17 @@ def gather_evidence(recording: Recording) -> Evidence:
     settings = read(settings_file, read_settings)
     if settings is not None and settings_file is not None:
         warnings += [f"By the settings {settings_file.name}, {problem}." for problem in settings.problems]
-    evidence = Evidence(
-        settings=settings,
-        subtitles=tuple(read(files.subtitles, read_subtitles) for files in found),
-        frame_logs_ns=tuple(read(files.frame_times, read_clock_log) for files in found),
-        flash_logs_ns=tuple(read(files.flash_times, read_clock_log) for files in found),
-        files=tuple(used),
-        warnings=(),
-    )
-    for part, subtitles in zip(recording.parts, evidence.subtitles, strict=True):
+    subtitles = tuple(read(files.subtitles, read_subtitles) for files in found)
+    frame_logs_ns = tuple(read(files.frame_times, read_clock_log) for files in found)
+    flash_logs_ns = tuple(read(files.flash_times, read_clock_log) for files in found)
+    for part, text in zip(recording.parts, subtitles, strict=True):
         video = part.video
-        if subtitles is not None and subtitles.end_s > video.start_s + video.duration_s + _SUBTITLE_SLACK_S:
+        if text is not None and text.end_s > video.start_s + video.duration_s + _SUBTITLE_SLACK_S:
             warnings.append(
-                f"{video.path.stem}.srt is {subtitles.end_s:.0f} s long and {video.path.name} "
+                f"{video.path.stem}.srt is {text.end_s:.0f} s long and {video.path.name} "
                 f"{video.duration_s:.0f} s: the video was cut, or they do not belong together."
             )
-    return Evidence(**{**vars(evidence), "warnings": tuple(warnings)})
+    return Evidence(tuple(used), settings, subtitles, frame_logs_ns, flash_logs_ns, tuple(warnings))
 
 
 def tie_frame_times(

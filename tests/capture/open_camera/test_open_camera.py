@@ -428,9 +428,20 @@ def test_a_file_that_changes_between_the_passes_is_an_error(
     assert Session.open(tmp_path / "S").status == "interrupted"
 
 
-def test_masks_are_no_business_of_videos(video: Path, tmp_path: Path) -> None:
-    with pytest.raises(SourceError, match="--masks"):
-        import_videos([video], tmp_path / "S", ImportOptions(masks=tmp_path))
+@pytest.mark.parametrize(
+    ("option", "complaint"),
+    [
+        ({"masks": Path("masks")}, "--masks is for image sets"),
+        ({"kept_rate_hz": 0.0}, "positive --rate"),
+        ({"kept_rate_hz": float("nan")}, "positive --rate"),
+        ({"max_frames": 1}, "too few"),
+    ],
+)
+def test_options_that_make_no_sense_for_a_video_are_refused(
+    option: dict[str, object], complaint: str, video: Path, tmp_path: Path
+) -> None:
+    with pytest.raises(SourceError, match=complaint):
+        import_videos([video], tmp_path / "S", ImportOptions(**option))  # type: ignore[arg-type]
 
 
 # ---------------------------------------------------------------- poses
