@@ -16,9 +16,9 @@ class TaggingConfig:
         shortest_period_s: of the flash.
         longest_period_s: of the flash.
         longest_on_s: the longest pulse looked for; the frames between pulses must be the larger part.
-        min_separation: distance of the two classes of log gain in their pooled spread, below which nothing is tagged.
-            Six makes a chance split of ten thousand unlit frames unlikely even for the heavy tails that camera motion
-            gives (measured: 4.5 at most on 200 walks without flash).
+        min_separation: distance of the classes' log gains in spreads of the unlit one, below which nothing is tagged.
+            Camera motion has heavy tails, so five is not as much as it seems; what is found must also come often enough
+            and with the same pattern each time.
         full_lit: a frame is lit when every row has at least this share of the pulse's light.
         none_lit: a frame is unlit when no row has more than this.
         risk: a label is given only when the probability that it is wrong, over the uncertain pulse edges, is below
@@ -35,7 +35,7 @@ class TaggingConfig:
     shortest_period_s: float = 0.5
     longest_period_s: float = 2.0
     longest_on_s: float = 0.35
-    min_separation: float = 6.0
+    min_separation: float = 5.0
     full_lit: float = 0.98
     none_lit: float = 0.02
     risk: float = 0.01

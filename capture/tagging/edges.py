@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capture.tagging.bands import BandGains
-from capture.tagging.shutter import share_after
+from capture.tagging.shutter import lit_share, share_after
 
 Floats = NDArray[np.float64]
 
@@ -186,9 +186,7 @@ class _Model:
     def _lit(self, on_s: Floats, off_s: Floats) -> Floats:
         """[P, G, n, B] lit shares."""
         start, bands = self._data.start_s[:, None, :], self._data.gain.shape[-1]
-        return share_after(start, on_s[..., None], self._readout_s, self._exposure_s, bands) - share_after(
-            start, off_s[..., None], self._readout_s, self._exposure_s, bands
-        )
+        return lit_share(start, on_s[..., None], off_s[..., None], self._readout_s, self._exposure_s, bands)
 
     def _full_gain(self, lit: Floats) -> Floats:
         """[P, G, B] least-squares gain of fully lit bands for lit shares [P, G, n, B]; not negative."""
@@ -202,19 +200,27 @@ def calibrated(data: BandGains, found: Edges, readout_s: float, exposure_s: floa
 
     The scale is that of largest likelihood under the Student-t error. Over a run of bands, the variance of the mean of
     independent errors falls with the run's length; what it exceeds that by is how many bands it takes to count as one.
+    A pulse whose residuals are larger than the others' (a reference that lost the motion) counts less than they do.
     """
     bands = data.gain.shape[-1]
-    lit = share_after(data.start_s, found.on.best_s[:, None], readout_s, exposure_s, bands) - share_after(
-        data.start_s, found.off.best_s[:, None], readout_s, exposure_s, bands
+    lit = lit_share(
+        data.start_s, found.on.best_s[:, None], found.off.best_s[:, None], readout_s, exposure_s, bands
     )
     error = (data.gain - lit * found.gain[:, None]) * np.sqrt(data.weight)
-    present = data.weight > 0
-    square = np.square(error[present])
+    whole = _variance_factor(error[data.frames >= 0])
+    each = [_variance_factor(e[f >= 0]) for e, f in zip(error, data.frames, strict=True)]
+    factor = np.maximum(each, whole)
+    return BandGains(data.start_s, data.gain, data.weight / factor[:, None, None], data.frames)
+
+
+def _variance_factor(error: Floats) -> float:
+    """By how much the variances of errors [n, B], in units of their expected sigma, are larger than expected."""
+    square = np.square(error)
     scale2 = 1.0
     for _ in range(20):
-        scale2 = float(np.mean((_TAIL + 1) * square / (_TAIL + square / scale2)))
-    limited = np.clip(error / np.sqrt(scale2), -3, 3) * present
-    runs = limited.reshape(*limited.shape[:2], -1, _RUN)
-    together = max(_RUN * float(np.mean(runs.mean(axis=-1) ** 2) / np.mean(limited**2)), 1.0)
-    factor = 1.0 / (max(scale2, _LEAST_SCALE2) * together)
-    return BandGains(data.start_s, data.gain, data.weight * factor, data.frames)
+        scale2 = max(float(np.mean((_TAIL + 1) * square / (_TAIL + square / scale2))), 1e-12)
+    scale2 = max(scale2, _LEAST_SCALE2)
+    limited = np.clip(error / np.sqrt(scale2), -3, 3)
+    runs = limited.reshape(len(error), -1, _RUN).mean(axis=-1)
+    together = _RUN * float(np.mean(runs**2)) / max(float(np.mean(limited**2)), 1e-12)
+    return scale2 * max(together, 1.0)

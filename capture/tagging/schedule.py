@@ -119,17 +119,19 @@ def neighbours_log_prior(curve: EdgeCurve, cycle: NDArray[np.int_], period_s: fl
     """What the other pulses say of each edge's time: [P, G] log density on the curve's grid, leaving the pulse itself out.
 
     The lateness u = t - n T is a random walk over the cycles n; forward and backward messages of the walk (Rabiner 1989)
-    meet at each pulse. Step and period are those of the largest likelihood, so an irregular flash gives a wide prior and a
-    regular one a sharp prior, also where all edges fall into the gap between two frames.
+    meet at each pulse. The step is averaged over, so an irregular flash gives a wide density and a regular one a sharp
+    density, also where all edges fall into the gap between two frames.
     """
     log_prior = np.zeros_like(curve.log)
     known = np.flatnonzero(cycle >= 0)
     if len(known) < 3:
         return log_prior
     walk = _Walk(curve, known, cycle[known], period_s)
-    walk.learn()
-    for p, (time_s, density) in zip(known, walk.messages(), strict=True):
-        log_prior[p] = np.log(np.interp(curve.time_s[p], time_s, density) + _LEAST_DENSITY)
+    density = np.zeros((len(known), curve.time_s.shape[1]))
+    for weight, likely_period_s, step_s in walk.hypotheses():
+        for i, (time_s, message) in enumerate(walk.messages(likely_period_s, step_s)):
+            density[i] += weight * np.interp(curve.time_s[known[i]], time_s, message)
+    log_prior[known] = np.log(density / density.max(axis=1, keepdims=True) + _LEAST_DENSITY)
     return log_prior
 
 
@@ -141,37 +143,44 @@ class _Walk:
         # likelihood integrated over time, so that a grid cell gets what lies in it however narrow the peak
         cell = curve.probability()[known]
         self._mass = np.cumsum(cell, axis=1) - 0.5 * cell
-        self._period_s, self._step_s = period_s, float(_STEPS_S[-1])
+        self._period_s = period_s
         late = curve.best_s[known] - cycle * period_s
         self._origin = float(np.median(late))
         self._reach = float(np.max(np.abs(late - self._origin)) + np.ptp(self._time, axis=1).max())
 
-    def learn(self) -> None:
-        """Set step and period to the most likely ones."""
+    def hypotheses(self) -> list[tuple[float, float, float]]:
+        """(probability, period, step) of each step, with the period that is most likely for it."""
         last = min(len(self._cycle), _MOST_PULSES)
         span = float(self._cycle[last - 1] - self._cycle[0])
-        best = (-np.inf, self._period_s, self._step_s)
+        found: list[tuple[float, float, float]] = []
         for step_s in _STEPS_S[::-1]:
+            centre = max(found)[1] if found else self._period_s
             # the mean of a walk of n steps is known to step / sqrt(n)
-            reach = 3 * max(float(step_s), best[2]) / np.sqrt(span) + 2e-4 / span
-            found = optimize.minimize_scalar(
+            reach = 3 * max([float(step_s), *(f[2] for f in found[-1:])]) / np.sqrt(span) + 2e-4 / span
+            best = optimize.minimize_scalar(
                 lambda period_s, s=step_s: -self._pass(last, period_s, s)[0],
-                bounds=(best[1] - reach, best[1] + reach),
+                bounds=(centre - reach, centre + reach),
                 method="bounded",
                 options={"maxiter": 10, "xatol": 0.3 * step_s / span},
             )
-            if -found.fun > best[0]:
-                best = (-float(found.fun), float(found.x), float(step_s))
-        _, self._period_s, self._step_s = best
+            found.append((-float(best.fun), float(best.x), float(step_s)))
+        highest = max(found)[0]
+        weights = [float(np.exp(value - highest)) for value, _, _ in found]
+        return [
+            (weight / sum(weights), period_s, step_s)
+            for weight, (_, period_s, step_s) in zip(weights, found, strict=True)
+            if weight > 1e-3
+        ]
 
-    def messages(self) -> list[tuple[Floats, Floats]]:
+    def messages(self, period_s: float, step_s: float) -> list[tuple[Floats, Floats]]:
         """Per pulse: times, and the density that all other pulses give there."""
         count = len(self._cycle)
-        _, ahead = self._pass(count, self._period_s, self._step_s)
-        _, back = self._pass(count, self._period_s, self._step_s, backward=True)
-        late = self._grid(self._step_s) + self._origin
+        _, ahead = self._pass(count, period_s, step_s)
+        _, back = self._pass(count, period_s, step_s, backward=True)
+        grid = self._grid(step_s)
+        spacing = grid[1] - grid[0]
         return [
-            (late + n * self._period_s, a * b / max(float((a * b).max()), 1e-300))
+            (grid + self._origin + n * period_s, a * b / max(float((a * b).sum()) * spacing, 1e-300))
             for n, a, b in zip(self._cycle, ahead, back, strict=True)
         ]
 

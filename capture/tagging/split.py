@@ -24,8 +24,8 @@ Floats = NDArray[np.float64]
 BLOCKS = 16
 # Log gains beyond this are motion of a window or a lamp, not flash shape; e^1.5 = 4.5 times still counts in full.
 _LARGEST_LOG_GAIN = 1.5
-# Rounds of finding pattern and classes: half of them with the classes still unknown to the reference.
-_ROUNDS = 6
+# Rounds of finding pattern and classes, at most; in the first the classes are still unknown to the reference.
+_ROUNDS, _BLIND_ROUNDS = 14, 3
 # Log gain that quantisation leaves in a block when nothing moves; keeps still blocks from taking all the weight.
 _LEAST_NOISE = 1e-3
 # Of a reference: frames on each side. More would average noise but reach further into the camera's motion.
@@ -85,7 +85,7 @@ def split_frames(
         if not core.any():
             break
         unlit = ~ndimage.binary_dilation(core, iterations=1)
-        if turn >= _ROUNDS // 2:  # the classes are good enough to look only at unlit frames, and nearer ones
+        if turn >= _BLIND_ROUNDS:  # the classes are good enough to look only at unlit frames, and nearer ones
             gain = np.clip(_local_gain(pts_s, log, unlit), -_LARGEST_LOG_GAIN, _LARGEST_LOG_GAIN)
             noise = _spread(gain[unlit]) + _LEAST_NOISE
         # Smoothing leaves the pattern few degrees of freedom, so that chance cannot carve one out of noise.
@@ -96,7 +96,9 @@ def split_frames(
             break
         score = gain @ weight / (pattern @ weight)
         score = score - np.median(score[unlit])
-        core = _brief(pts_s, score > 0.5 * np.median(score[core]), config)
+        before, core = core, _brief(pts_s, score > 0.5 * np.median(score[core]), config)
+        if turn > _BLIND_ROUNDS and np.array_equal(before, core):
+            break
     return _checked(score, core, pattern, noise, side, config, most_lit)
 
 
@@ -190,20 +192,24 @@ def _symmetric_gain(pts_s: Floats, log: Floats, config: TaggingConfig) -> Floats
 
 
 def _local_gain(pts_s: Floats, log: Floats, unlit: NDArray[np.bool_]) -> Floats:
-    """[K, N] log gain over a straight line in time through the nearest unlit frames on both sides."""
-    index = np.flatnonzero(unlit)
-    gain = np.empty_like(log)
-    for k in range(len(pts_s)):
-        at = int(np.searchsorted(index, k))
-        # An unlit frame leaves itself and its neighbours out, as a lit frame has none: their spreads compare.
-        before = index[:at][index[:at] < k - 1]
-        after = index[at:][index[at:] > k + 1]
-        near = np.concatenate([before[-_SIDE:], after[:_SIDE]])
-        if len(before) < 1 or len(after) < 1:  # at an end: a line would extrapolate, take the nearest as they are
-            near = np.concatenate([before[-2:], after[:2]])
-            gain[k] = log[k] - log[near].mean(axis=0)
-            continue
-        t = pts_s[near] - pts_s[near].mean()
-        weight = 1 / len(near) + (pts_s[k] - pts_s[near].mean()) * t / max(float(t @ t), 1e-12)
-        gain[k] = log[k] - weight @ log[near]
-    return gain
+    """[K, N] log gain over a straight line in time through the nearest unlit frames on both sides.
+
+    At an end, where a line would extrapolate, over the mean of the two nearest on the other side.
+    """
+    index, k = np.flatnonzero(unlit), np.arange(len(pts_s))
+    # An unlit frame leaves itself and its neighbours out, as a lit frame has none: their spreads compare.
+    first_after = np.searchsorted(index, k + 2)
+    last_before = np.searchsorted(index, k - 2, side="right") - 1
+    reach = np.arange(_SIDE)
+    place = np.concatenate([last_before[:, None] - reach, first_after[:, None] + reach], axis=1)  # [K, 2 SIDE]
+    there = (place >= 0) & (place < len(index))
+    alone = ~(there[:, :_SIDE].any(axis=1) & there[:, _SIDE:].any(axis=1))
+    there[alone[:, None] & (np.tile(reach, 2) >= 2)] = False
+    near = index[np.clip(place, 0, len(index) - 1)]
+    count = np.maximum(there.sum(axis=1, keepdims=True), 1)
+    t = np.where(there, pts_s[near], 0.0)
+    middle = t.sum(axis=1, keepdims=True) / count
+    t = np.where(there, t - middle, 0.0)
+    slope = (pts_s[:, None] - middle) * t / np.maximum((t**2).sum(axis=1, keepdims=True), 1e-12)
+    weight = np.where(there, 1 / count + np.where(alone[:, None], 0.0, slope), 0.0)
+    return log - np.einsum("km,kmn->kn", weight, log[near])
