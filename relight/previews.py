@@ -27,7 +27,7 @@ from relight.lighting import CapturedLight, DirectionalLight, FlashLight, Light,
 from relight.maps import Maps
 from relight.portrait import Portrait
 from relight.raster import NEAR_M, project
-from relight.render import EXPOSED_TO, PortraitRenderer, display_picture, orbit_cameras
+from relight.render import PortraitRenderer, display_picture, exposure_for, orbit_cameras
 from relight.stages import Progress, no_progress
 from relight.upright import upright_camera, upright_picture
 
@@ -129,13 +129,6 @@ def framed(camera: Camera, points: torch.Tensor) -> Camera:
     width, height = (int(side) for side in high - low)
     cropped = replace(camera, width=width, height=height, K=K)
     return _small(cropped)
-
-
-def exposure_for(radiance: torch.Tensor, mask: torch.Tensor) -> float:
-    """Factor that brings the brightest half percent of the head to `EXPOSED_TO`; 1 where all is dark."""
-    lit = radiance.amax(dim=-1)[mask > 0.5]
-    top = float(np.percentile(lit.cpu().numpy(), 99.5)) if len(lit) else 0.0
-    return EXPOSED_TO / top if top > 0 else 1.0
 
 
 class _Gallery:

@@ -224,14 +224,19 @@ def display_picture(radiance: torch.Tensor, mask: torch.Tensor, exposure: float 
     return picture
 
 
+def exposure_for(radiance: torch.Tensor, mask: torch.Tensor) -> float:
+    """Factor that brings the brightest half percent of the subject to `EXPOSED_TO`; 1 where all is dark."""
+    lit = radiance.amax(dim=-1)[mask > 0.5]
+    top = float(np.percentile(lit.cpu().numpy(), 99.5)) if len(lit) else 0.0
+    return EXPOSED_TO / top if top > 0 else 1.0
+
+
 def _exposure(light: Light, radiance: torch.Tensor, mask: torch.Tensor) -> float:
     """1 for the captured lights; for others what brings the brightest half percent to `EXPOSED_TO`."""
     parts = light.parts if isinstance(light, SumLight) else (light,)
     if any(isinstance(part, _CAPTURED) for part in parts):
         return 1.0
-    lit = radiance.amax(dim=-1)[mask > 0.5]
-    top = float(np.percentile(lit.cpu().numpy(), 99.5)) if len(lit) else 0.0
-    return EXPOSED_TO / top if top > 0 else 1.0
+    return exposure_for(radiance, mask)
 
 
 def _write_maps(view: Maps, out: Path, name: str) -> list[Path]:
