@@ -52,6 +52,7 @@ _SAMPLE = 10_000  # points from which global quantities are fitted
 _ROOM_RELATIVE = 0.06  # spread of a point's room radiance over the views that counts as noise, e.g. gloss
 _FLOOR = 0.004  # radiance of one 8-bit code in the shadows, and albedo that is as good as black
 _BESIDE_RAD = 0.07  # 4 degrees: a good deal less than the width of a highlight of skin
+_ROOM_MOVING = 0.5  # of the mean: a moving highlight stays within, what passes before the camera does not
 _ROOM_PRIOR = 0.3  # weight of the mean over all views, in frames that face the point
 _GLOSS_CUBE = 8.0  # spacings: gloss changes with the material, over centimetres
 _GLOSS_STEP = 4  # every so many points are enough for what is pooled
@@ -234,6 +235,9 @@ def _flash_part(
     positions = observations.flash_position_world[lit]
     for part in _chunks(len(points)):
         share = observations.cosine[dark, part]
+        luminance, mean = observations.radiance[dark, part].mean(dim=-1), room[part].mean(dim=-1)
+        deviation = (luminance - mean) / (_ROOM_MOVING * mean + _FLOOR)
+        share = share / (1.0 + deviation * deviation) ** 2
         beside = nearness @ (share[..., None] * observations.radiance[dark, part]).flatten(1)
         total = (nearness @ share)[..., None] + _ROOM_PRIOR
         beside = (beside.view(len(nearness), -1, 3) + _ROOM_PRIOR * room[part]) / total
