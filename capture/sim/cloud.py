@@ -56,7 +56,7 @@ def stereo_cloud(bust: Bust, cameras: list[Camera], count: int, rng: np.random.G
     Noise of 0.5 mm along the ray of the camera that sees a point best, more at grazing angles; bumps of 0.4
     mm; about 2 % of the points missing in holes and 1 % of outliers. No normals, no colours.
     """
-    exact = sample_surface(bust, round(count * 1.5), rng)
+    exact = sample_surface(bust, 5 * count // 2, rng)  # half and more may be hidden or below the picture
     assert exact.normals is not None
     best = np.full(len(exact.points), 0.15)  # cosine below which stereo finds nothing
     rays = np.zeros_like(exact.points)

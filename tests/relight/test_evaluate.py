@@ -35,6 +35,7 @@ def sphere_portrait(count=30_000):
         albedo=albedo,
         room_radiance=albedo * torch.tensor(C_ROOM),
         shading=torch.ones(count),
+        gloss=torch.ones(count),
         confidence=torch.ones(count),
         albedo_sigma=torch.zeros(count),
         normal_sigma_rad=torch.zeros(count),
