@@ -62,6 +62,7 @@ _OUTSIDE_LIMIT = (
     0.05  # share of the frames that may show a point off the subject: masks and poses err by a pixel
 )
 _ITERATIONS = 4
+_GAIN_STEPS = 8  # a step carries gains to the frames that see the same points; a lamp droops over all of them
 
 
 @dataclass(frozen=True)
@@ -141,11 +142,20 @@ def solve(scene: Scene, config: SolveConfig = SolveConfig(), progress: Progress 
     on_subject = observations.outside <= _OUTSIDE_LIMIT
     observations.cosine.mul_(on_subject)
     if not bool((observations.cosine > 0).any()):
-        raise PlanError("No frame sees any point of the cloud; are poses and cloud in the same coordinates?")
+        raise PlanError(
+            "No frame shows a point of the cloud, unclipped and inside its mask; are poses and cloud in the "
+            "same coordinates, and the frames exposed well?"
+        )
 
     room, room_information = _room_radiance(observations)
     flash = _flash_part(observations, points, room, room_information)
     scale, reflectance, gains = _global_quantities(flash, prior, config)
+    lamps = observations.flash_position_world[observations.flash]
+    if scale < _FLOOR * float(((lamps - points.mean(dim=0)) ** 2).sum(dim=1).median()):
+        raise PlanError(
+            f"The flash frames are no brighter than the others (by less than {_FLOOR} of white); is the "
+            "flash flag of the frames right?"
+        )
     normals, sigma = torch.empty_like(prior), points.new_empty(len(points))
     albedo, information, residual = torch.empty_like(prior), torch.empty_like(sigma), torch.empty_like(sigma)
     flash = _normalised(flash, scale, gains)
@@ -171,6 +181,9 @@ def solve(scene: Scene, config: SolveConfig = SolveConfig(), progress: Progress 
     albedo = (albedo * gauge).clamp(min=0.0)
     c_room, shading = _split_room(room, albedo, information > config.known)
     normal_sigma = _normal_sigma(information, relative, config.normal_sigma_rad)
+    # An error of the normal is one of the cosine, by the tangent, whose square is about 0.5, and so of the
+    # albedo.
+    sigma = (sigma**2 + 0.5 * (normal_sigma * albedo.mean(dim=1) / gauge) ** 2).sqrt()
     share = information / config.known
     portrait = Portrait(
         points=points,
@@ -277,8 +290,8 @@ def _global_quantities(
         scaled = response / scale / gains[:, None]
         if config.fit_gloss:
             reflectance = fit_reflectance(cosine, scaled, weight)
-        if config.fit_gains:
-            gains = gains * _frame_gains(cosine, scaled, weight, reflectance)
+        for _ in range(_GAIN_STEPS if config.fit_gains else 0):
+            gains = gains * _frame_gains(cosine, response / scale / gains[:, None], weight, reflectance)
     return scale, reflectance, gains
 
 
@@ -396,6 +409,9 @@ def _fit_albedo(
     variance = (weight * deviation**2).sum(dim=0) / weight.sum(dim=0).clamp(min=1e-6)
     variance = variance * frames / (frames - 1).clamp(min=1)
     residual = variance.sqrt() / (albedo.mean(dim=-1).abs() + _FLOOR)
+    if relative is not None:  # few frames say little of their own spread: the subject's counts as one more
+        usual = relative * albedo.mean(dim=-1).abs() + _FLOOR
+        variance = ((frames - 1).clamp(min=0) * variance + usual**2) / frames.clamp(min=1)
     return albedo, information, residual, (variance / information.clamp(min=1e-6)).sqrt().clamp(max=1.0)
 
 
