@@ -9,7 +9,7 @@ the units of the project: metres, radiance 1.0 = white clip, OpenCV axes.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -214,17 +214,29 @@ def photograph(head, camera, gain=1.0):
     eye = camera.centre_world
     distance = head.intersect(np.broadcast_to(eye, rays.shape), rays)
     hit = np.isfinite(distance)
-    points, normals, albedo, radiance = (np.zeros((len(rays), 3)) for _ in range(4))
+    points, normals = np.zeros((len(rays), 3)), np.zeros((len(rays), 3))
     points[hit] = eye + distance[hit, None] * rays[hit]
     normals[hit] = head.normals(points[hit])
-    albedo[hit] = head.albedo(points[hit])
-    radiance[hit] = albedo[hit] * head.room(normals[hit])
-    if camera.flash:
-        flash = eye + camera.cam_from_world[:3, :3].T @ FLASH_OFFSET_CAM_M
-        radiance[hit] += gain * head.flash_radiance(points[hit], normals[hit], albedo[hit], flash, eye)
     shape = (camera.height, camera.width)
-    layers = (layer.reshape(*shape, 3) for layer in (points, normals, albedo, radiance))
-    return Frame(camera, hit.reshape(shape), *layers)
+    empty = np.zeros((*shape, 3))
+    frame = Frame(
+        camera, hit.reshape(shape), points.reshape(empty.shape), normals.reshape(empty.shape), empty, empty
+    )
+    return expose(head, frame, gain)
+
+
+def expose(head, frame, gain=1.0):
+    """A frame once more, of a subject or room of other colours and gloss but of the same shape."""
+    camera, hit = frame.camera, frame.hit
+    albedo, radiance = np.zeros_like(frame.points), np.zeros_like(frame.points)
+    points, normals = frame.points[hit], frame.normals[hit]
+    albedo[hit] = head.albedo(points)
+    radiance[hit] = albedo[hit] * head.room(normals)
+    if camera.flash:
+        eye = camera.centre_world
+        flash = eye + camera.cam_from_world[:3, :3].T @ FLASH_OFFSET_CAM_M
+        radiance[hit] += gain * head.flash_radiance(points, normals, albedo[hit], flash, eye)
+    return replace(frame, albedo=albedo, radiance=radiance)
 
 
 def cloud_of(head, count, noise_m=0.0, seed=0):
