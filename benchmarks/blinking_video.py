@@ -1,8 +1,10 @@
-"""A light video simulator for the tagger: a hand-held walk around a head lit by a blinking flash, rolling shutter.
+"""A light video simulator for the tagger: a hand-held walk around a head lit by a blinking flash, rolling
+shutter.
 
-It is no renderer (the simulated rig is): the head and the room are flat textures that move as a camera would make them
-move. What matters for tagging is exact: every sensor row integrates the lamp's waveform over its own exposure, light adds
-linearly, and noise, clipping and 8-bit encoding come after. The scene shares no code with `capture.tagging`.
+It is no renderer (the simulated rig is): the head and the room are flat textures that move as a camera
+would make them move. What matters for tagging is exact: every sensor row integrates the lamp's waveform
+over its own exposure, light adds linearly, and noise, clipping and 8-bit encoding come after. The scene
+shares no code with `capture.tagging`.
 """
 
 from __future__ import annotations
@@ -28,13 +30,16 @@ class Video:
     height: int = 180
     rate_hz: float = 30.0
     duration_s: float = 10.0
-    readout_s: float = 0.02  # first row's start to the start of the row after the last; negative: bottom row first
+    readout_s: float = (
+        0.02  # first row's start to the start of the row after the last; negative: bottom row first
+    )
     exposure_s: float = 0.005
     # --- lamp
     period_s: float = 1.0
     on_s: float = 0.1
     first_s: float = 0.37
-    timer: str = "hardware"  # "hardware": fixed rate, 0.1 ms jitter; "phone": fixed delay with jank, as Android's Timer
+    # "hardware": fixed rate, 0.1 ms jitter; "phone": fixed delay with jank, as Android's Timer
+    timer: str = "hardware"
     rise_s: float = 0.0
     fall_s: float = 0.0
     droop: float = 0.0  # share of the light lost by the end of a pulse
@@ -86,7 +91,11 @@ def _pulses(video: Video, rng: np.random.Generator) -> tuple[Floats, Floats]:
         on.append(t + late)
         off.append(t + late + video.on_s + longer)
         # fixed delay: the next start counts from this one, so lateness accumulates
-        t = t + video.period_s if video.timer == "hardware" else t + late + video.period_s + rng.exponential(0.003)
+        t = (
+            t + video.period_s
+            if video.timer == "hardware"
+            else t + late + video.period_s + rng.exponential(0.003)
+        )
     keep = [i for i in range(len(on)) if i not in video.missed]
     return np.array(on)[keep], np.array(off)[keep]
 
@@ -123,15 +132,14 @@ def make_truth(video: Video) -> Truth:
         lit += (end - _lamp_integral(row_start, a, b, video)) / video.exposure_s
     # a drooping lamp is fully on at its lowest level
     full = TRUTH_FULL * (1 - video.droop)
-    labels = tuple(
-        1 if row.min() >= full else 0 if row.max() <= TRUTH_NONE else None for row in lit
-    )
+    labels = tuple(1 if row.min() >= full else 0 if row.max() <= TRUTH_NONE else None for row in lit)
     return Truth(pts_s=start, lit=lit, on_s=on, off_s=off, labels=labels)
 
 
 @lru_cache(maxsize=4)
 def _texture(seed: int, contrast: float) -> NDArray[np.float32]:
-    """A wrapped picture with a 1/f spectrum and hard-edged things in it, mean about 0.35, range 0.03 to 0.9."""
+    """A wrapped picture with a 1/f spectrum and hard-edged things in it, mean about 0.35, range 0.03 to
+    0.9."""
     rng = np.random.default_rng(seed)
     f = np.hypot(*np.meshgrid(np.fft.fftfreq(CANVAS_PX), np.fft.fftfreq(CANVAS_PX)))
     spectrum = np.fft.fft2(rng.standard_normal((CANVAS_PX, CANVAS_PX))) / np.maximum(f, 1 / CANVAS_PX)
@@ -179,8 +187,26 @@ class _Path:
         self.turn = speed * w * (t + 0.4 * np.cumsum(sway - 1) * np.gradient(t)) if len(t) > 1 else t * 0
 
 
+def _seen(
+    picture: NDArray[np.float32],
+    size: tuple[int, int],
+    scale: float,
+    turn: tuple[float, float],
+    centre: tuple[float, float],
+    x0: float,
+    shear: float,
+) -> NDArray[np.float32]:
+    """A texture [h, w] as a camera that rolls by (cos, sin) about a centre sees it, its rows sheared."""
+    (cos, sin), (cx, cy) = turn, centre
+    m = scale * np.array([[cos, -sin + shear, 0.0], [sin, cos, 0.0]])
+    m[:, 2] = [scale * x0 - m[0] @ [cx, cy, 0], 500 - m[1] @ [cx, cy, 0]]
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    return cv2.warpAffine(picture, m, size[::-1], flags=flags, borderMode=cv2.BORDER_WRAP)
+
+
 def frames(video: Video) -> Iterator[tuple[NDArray[np.uint8], float]]:
-    """The frames [H, W] (or [H, W, 3] with `color`) uint8 sRGB, each with its presentation time in seconds."""
+    """The frames [H, W] (or [H, W, 3] with `color`) uint8 sRGB, each with its presentation time in
+    seconds."""
     truth = make_truth(video)
     rng = np.random.default_rng(video.seed + 3000)
     t, (h, w) = truth.pts_s, (video.height, video.width)
@@ -190,20 +216,18 @@ def frames(video: Video) -> Iterator[tuple[NDArray[np.uint8], float]]:
     row = ((np.arange(h, dtype=np.float32) + 0.5) / h)[:, None]
     yy, xx = np.mgrid[0:h, 0:w].astype(np.float32)
     velocity = np.gradient(path.turn, t) if len(t) > 1 else np.zeros(len(t))
-    tint = np.array([1.1, 1.0, 0.75], np.float32) if video.color else None  # a warm room under a neutral flash
+    tint = (
+        np.array([1.1, 1.0, 0.75], np.float32) if video.color else None
+    )  # a warm room under a neutral flash
     for k, pts in enumerate(t):
         cos, sin = np.cos(path.roll[k]) / path.zoom[k], np.sin(path.roll[k]) / path.zoom[k]
         cx, cy = w / 2 + path.head_x[k], h * 0.55 + path.head_y[k]
         shear = velocity[k] * video.readout_s / h  # the picture moves while the rows are read
         scale = 320 / w  # textures are drawn for a width of 320
 
-        def sample(picture: NDArray[np.float32], x0: float, shear: float) -> NDArray[np.float32]:
-            m = scale * np.array([[cos, -sin + shear, 0.0], [sin, cos, 0.0]])
-            m[:, 2] = [scale * x0 - m[0] @ [cx, cy, 0], 500 - m[1] @ [cx, cy, 0]]
-            return cv2.warpAffine(picture, m, (w, h), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, borderMode=cv2.BORDER_WRAP)
-
-        background = sample(room_picture, 300 + path.turn[k], shear)
-        surface = sample(head_picture, 300 + 0.25 * path.turn[k], 0.25 * shear)
+        turn, centre = (cos, sin), (cx, cy)
+        background = _seen(room_picture, (h, w), scale, turn, centre, 300 + path.turn[k], shear)
+        surface = _seen(head_picture, (h, w), scale, turn, centre, 300 + 0.25 * path.turn[k], 0.25 * shear)
         # an upright ellipse of 0.36 x 0.8 frame heights on shoulders, in the camera's frame
         dx, dy = (xx - cx) / (0.30 * h * path.zoom[k]), (yy - cy) / (0.42 * h * path.zoom[k])
         inside = np.clip((1 - dx * dx - dy * dy) * 6, 0, 1)
@@ -219,12 +243,16 @@ def frames(video: Video) -> Iterator[tuple[NDArray[np.uint8], float]]:
             # light of |sin|^2 type, averaged over the exposure
             middle = pts + row * video.readout_s + video.exposure_s / 2
             blur = np.sinc(video.flicker_hz * video.exposure_s)
-            room = room * (1 + video.flicker_depth * blur * np.cos(2 * np.pi * video.flicker_hz * middle)).astype(np.float32)
+            room = room * (
+                1 + video.flicker_depth * blur * np.cos(2 * np.pi * video.flicker_hz * middle)
+            ).astype(np.float32)
         lit = truth.lit[k][:, None].astype(np.float32)
         flash = albedo * (np.float32(max(video.room, 0.06)) * lit * flash_gain)
         exposure = np.exp(video.drift_per_s * pts)
         if tint is None:
-            gain = exposure * (video.step[1] if video.step_at_s is not None and pts >= video.step_at_s else 1.0)
+            gain = exposure * (
+                video.step[1] if video.step_at_s is not None and pts >= video.step_at_s else 1.0
+            )
             linear = (albedo * room + flash) * np.float32(gain)
         else:
             channel_gain = exposure * (

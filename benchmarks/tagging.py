@@ -3,10 +3,11 @@
     python -m benchmarks.tagging --out benchmarks/results/tagging.json
     python -m benchmarks.tagging --only timing --out timing.json
 
-Grid: readout 10, 20, 33 ms x pulse 60, 100, 150 ms x room light (flash on the head 1.2, 1.5, 2.3 times the room) x motion
-(held, walked), each with a microcontroller's timer and with a phone's. Then cases of trouble: flicker, dropped frames, slow
-lamp, drooping lamp, drift, missed pulses, long exposure, no flash at all. A label is wrong when it contradicts the rows' true
-light at the limits 0.98 and 0.02, however little; the worst row tells how far. Uncertain frames count as missed.
+Grid: readout 10, 20, 33 ms x pulse 60, 100, 150 ms x room light (flash on the head 1.2, 1.5, 2.3 times the
+room) x motion (held, walked), each with a microcontroller's timer and with a phone's. Then cases of
+trouble: flicker, dropped frames, slow lamp, drooping lamp, drift, missed pulses, long exposure, no flash at
+all. A label is wrong when it contradicts the rows' true light at the limits 0.98 and 0.02, however little;
+the worst row tells how far. Uncertain frames count as missed.
 """
 
 from __future__ import annotations
@@ -57,21 +58,26 @@ def grid(seed: int) -> Iterable[tuple[dict[str, Any], Video]]:
             "room": room,
             "motion": motion,
         }
-        yield name, case(
-            readout_s=readout_s,
-            on_s=on_s,
-            gain=GAINS[room],
-            motion=motion,
-            timer=timer,
-            seed=1000 * seed + number,
-            first_s=0.2 + 0.013 * (number % 30),
+        yield (
+            name,
+            case(
+                readout_s=readout_s,
+                on_s=on_s,
+                gain=GAINS[room],
+                motion=motion,
+                timer=timer,
+                seed=1000 * seed + number,
+                first_s=0.2 + 0.013 * (number % 30),
+            ),
         )
 
 
 TROUBLE: dict[str, Video] = {
     "flicker 100 Hz, 30 %": case(flicker_hz=100.06, flicker_depth=0.3, timer="phone"),
     "flicker 120 Hz at 25/s, 30 %": case(flicker_hz=119.95, flicker_depth=0.3, rate_hz=25.0),
-    "flicker 100 Hz, no multiple of rows": case(flicker_hz=100.0, flicker_depth=0.3, readout_s=0.013, motion="hand"),
+    "flicker 100 Hz, no multiple of rows": case(
+        flicker_hz=100.0, flicker_depth=0.3, readout_s=0.013, motion="hand"
+    ),
     "one frame in ten dropped": case(dropped=0.1, timer="phone"),
     "irregular frame times": case(pts_jitter_s=0.001, timer="phone"),
     "lamp rises in 15 ms": case(rise_s=0.015, fall_s=0.005, timer="phone"),
@@ -159,9 +165,14 @@ def _line(name: dict[str, Any], row: dict[str, Any]) -> str:
     label = " ".join(f"{value:g}" if isinstance(value, float) else str(value) for value in name.values())
     if "refused" in row:
         return f"{label:44s} refused: {row['refused'][:100]}"
-    readout = "-" if row["readout_s"] is None else f"{1e3 * row['readout_s']:.1f}±{1e3 * row['readout_sigma_s']:.1f}"
+    readout = (
+        "-"
+        if row["readout_s"] is None
+        else f"{1e3 * row['readout_s']:.1f}±{1e3 * row['readout_sigma_s']:.1f}"
+    )
     return (
-        f"{label:44s} full {row['full_found']:3d}/{row['full']:3d}  partial {row['partial_found']:3d}/{row['partial']:3d}  "
+        f"{label:44s} full {row['full_found']:3d}/{row['full']:3d}  partial "
+        f"{row['partial_found']:3d}/{row['partial']:3d}  "
         f"false 1: {row['false_lit']} {_worst(row['false_lit_worst_row'])}  "
         f"false 0: {row['false_unlit']} {_worst(row['false_unlit_worst_row'])}  "
         f"pulses {row['pulses_found']}/{row['pulses']}  readout {readout} ms"
@@ -190,14 +201,17 @@ def totals(rows: list[dict[str, Any]]) -> dict[str, Any]:
         "false_lit": total("false_lit"),
         "false_lit_worst_row": min((r["false_lit_worst_row"] for r in done if r["false_lit"]), default=None),
         "false_unlit": total("false_unlit"),
-        "false_unlit_worst_row": max((r["false_unlit_worst_row"] for r in done if r["false_unlit"]), default=None),
+        "false_unlit_worst_row": max(
+            (r["false_unlit_worst_row"] for r in done if r["false_unlit"]), default=None
+        ),
     }
 
 
 def print_totals(title: str, sums: dict[str, Any]) -> None:
     print(
         f"{title:34s} full {100 * sums['full_found_share']:5.1f} % of {sums['full']:5d}   partial recall "
-        f"{100 * sums['partial_recall']:6.2f} % of {sums['partial']:5d}   unlit {100 * sums['unlit_found_share']:5.2f} %   "
+        f"{100 * sums['partial_recall']:6.2f} % of {sums['partial']:5d}   unlit "
+        f"{100 * sums['unlit_found_share']:5.2f} %   "
         f"false 1: {sums['false_lit']} {_worst(sums['false_lit_worst_row'])}   "
         f"false 0: {sums['false_unlit']} {_worst(sums['false_unlit_worst_row'])}"
     )
@@ -220,7 +234,9 @@ def measure_time(repeats: int) -> dict[str, Any]:
     return {
         "video": f"{video.width}x{video.height}, {count} frames, H.264",
         "decode_ms_a_frame": statistics.median(1e3 * a["cpu_s"] / count for a in bare),
-        "look_and_tag_ms_a_frame": statistics.median(1e3 * (b["cpu_s"] - a["cpu_s"]) / count for a, b in zip(bare, looked, strict=True)),
+        "look_and_tag_ms_a_frame": statistics.median(
+            1e3 * (b["cpu_s"] - a["cpu_s"]) / count for a, b in zip(bare, looked, strict=True)
+        ),
         "wall_ratio": {"median": statistics.median(ratio), "min": min(ratio), "max": max(ratio)},
         "cpu_ratio": statistics.median(b["cpu_s"] / a["cpu_s"] for a, b in zip(bare, looked, strict=True)),
     }
@@ -249,7 +265,9 @@ def _timed(work: Any) -> dict[str, float]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--out", type=Path, required=True, help="JSON file to write")
     parser.add_argument("--only", choices=("grid", "trouble", "refused", "timing"), help="one part")
     parser.add_argument("--seed", type=int, default=0, help="of the grid")
@@ -267,14 +285,21 @@ def main() -> None:
         results["trouble"] = {"cases": rows, "all": totals(rows)}
     if args.only in (None, "refused"):
         rows = run_cases(({"case": name}, video) for name, video in REFUSED.items())
-        results["refused"] = {"cases": rows, "refused": sum("refused" in row for row in rows), "of": len(rows)}
+        results["refused"] = {
+            "cases": rows,
+            "refused": sum("refused" in row for row in rows),
+            "of": len(rows),
+        }
     if args.only in (None, "timing"):
         results["timing"] = measure_time(args.repeats)
     for part, keys in (("grid", ("all", *TIMERS)), ("trouble", ("all",))):
         for key in keys if part in results else ():
             print_totals(f"{part}, {key}", results[part][key])
     if "refused" in results:
-        print(f"refused {results['refused']['refused']} of {results['refused']['of']} sequences without a blinking flash")
+        print(
+            f"refused {results['refused']['refused']} of {results['refused']['of']} sequences without a "
+            "blinking flash"
+        )
     if "timing" in results:
         print(results["timing"])
     write_record(args.out, "tagging", ("numpy", "scipy", "opencv-contrib-python-headless", "av"), results)

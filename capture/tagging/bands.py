@@ -15,11 +15,12 @@ Floats = NDArray[np.float64]
 
 # Gain that a block's texture and 8-bit codes leave even when nothing moves.
 _BLOCK_NOISE = 0.01
-# Vertical misfit of the reference after registration, in bands (0.3 thumbnail rows; measured on simulated hand-held video).
-# It moves a whole row of blocks up or down the picture's vertical slope together, so it does not average out over columns.
+# Vertical misfit of the reference after registration, in bands (0.3 thumbnail rows; measured on simulated
+# hand-held video). It moves a whole row of blocks up or down the picture's vertical slope together, so it
+# does not average out over columns.
 _MISFIT_BANDS = 0.15
-# The flash's own pattern moves with the head during the pulse, which the reference cannot follow: by so many bands, and
-# with gloss and turning surfaces by so large a share.
+# The flash's own pattern moves with the head during the pulse, which the reference cannot follow: by so
+# many bands, and with gloss and turning surfaces by so large a share.
 _PATTERN_SHIFT_BANDS, _PATTERN_CHANGE = 0.2, 0.02
 # Huber's limit in standard deviations, for blocks and for bands.
 _HUBER = 2.0
@@ -56,8 +57,9 @@ class BandGains:
 def band_gains(pulses: list[PulseGain], pattern: Floats, pts_s: Floats) -> BandGains:
     """Collapse the columns of each band into one gain.
 
-    The same column weights serve all frames of a pulse, so that rho = a g holds exactly whatever the pattern of the flash:
-    pattern over variance, the matched filter. Blocks that stick out (something moved) are pulled in (Huber).
+    The same column weights serve all frames of a pulse, so that rho = a g holds exactly whatever the
+    pattern of the flash: pattern over variance, the matched filter. Blocks that stick out (something moved)
+    are pulled in (Huber).
 
     Args:
         pulses: gains of the frames around each pulse.
@@ -68,7 +70,9 @@ def band_gains(pulses: list[PulseGain], pattern: Floats, pts_s: Floats) -> BandG
     shape = (len(pulses), longest)
     start, frames = np.zeros(shape), np.full(shape, -1)
     gain, weight = np.zeros((*shape, BANDS)), np.zeros((*shape, BANDS))
-    shape_of_flash = np.maximum(cv2.resize(np.expm1(pattern), (COLUMNS, BANDS), interpolation=cv2.INTER_LINEAR), 0)
+    shape_of_flash = np.maximum(
+        cv2.resize(np.expm1(pattern), (COLUMNS, BANDS), interpolation=cv2.INTER_LINEAR), 0
+    )
     shape_of_flash += 0.05 * shape_of_flash.max()  # every column may speak
     for p, pulse in enumerate(pulses):
         n = len(pulse.frames)

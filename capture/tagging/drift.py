@@ -1,8 +1,9 @@
 """Drift of exposure and white balance, measured on the frames without flash.
 
-A camera that walks changes what it sees, so levels say little. But from one unlit frame to the next the *median* block
-keeps its light whatever moves, unless exposure or gain change: those move all blocks by one factor at once. The running sum
-of these medians is the exposure's course; its noise is a random walk of known step.
+A camera that walks changes what it sees, so levels say little. But from one unlit frame to the next the
+*median* block keeps its light whatever moves, unless exposure or gain change: those move all blocks by one
+factor at once. The running sum of these medians is the exposure's course; its noise is a random walk of
+known step.
 """
 
 from __future__ import annotations
@@ -66,14 +67,20 @@ class Drift:
         out = []
         for step in self.steps:
             out.append(
-                f"The {_WORDS[step.channel]} jumps by {100 * step.share:+.1f} % at {step.time_s:.2f} s; lock exposure and "
+                f"The {_WORDS[step.channel]} jumps by {100 * step.share:+.1f} % at {step.time_s:.2f} s; "
+                "lock exposure and "
                 "white balance of the camera."
             )
         for name, share, sigma in (
             ("exposure", self.exposure_share, self.exposure_sigma),
             ("balance", self.balance_share, self.balance_sigma),
         ):
-            if share is not None and sigma is not None and abs(share) > max(WARN_SHARE, _DRIFT_SIGMAS * sigma) and not self.steps:
+            if (
+                share is not None
+                and sigma is not None
+                and abs(share) > max(WARN_SHARE, _DRIFT_SIGMAS * sigma)
+                and not self.steps
+            ):
                 grade = "more than may be" if abs(share) > FAIL_SHARE else "a little"
                 out.append(
                     f"The {_WORDS[name]} of the frames without flash drifts by {100 * share:+.1f} % "
@@ -90,7 +97,9 @@ _WORDS = {
 }
 
 
-def measure_drift(pts_s: Floats, blocks: Floats, color: Floats | None, unlit: NDArray[np.bool_]) -> Drift:
+def measure_drift(
+    pts_s: Floats, blocks: NDArray[np.float32], color: NDArray[np.float32] | None, unlit: NDArray[np.bool_]
+) -> Drift:
     """Drift over the unlit frames.
 
     Args:
@@ -156,7 +165,9 @@ def _steps(course: Floats, values: Floats) -> list[tuple[int, float]]:
             best = int(np.argmax(strength))
             at = int(k[best])
             here = slice(max(best - 2 * reach, 0), best + 2 * reach + 1)
-            if all(abs(at - other) > 2 * _STEP_REACHES[-1] for other, _ in found) and _agree(values, at, reach, size[best]):
+            if all(abs(at - other) > 2 * _STEP_REACHES[-1] for other, _ in found) and _agree(
+                values, at, reach, size[best]
+            ):
                 found.append((at, float(size[best])))
             strength[here] = 0
     return sorted(found)

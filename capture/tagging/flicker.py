@@ -1,8 +1,9 @@
 """Mains flicker of the room light: a wave over the rows whose phase runs on from frame to frame.
 
-Room light on the mains goes as 1 + m cos(2 pi f t) with f twice the line frequency. A row at position r of a frame that
-starts at s sees it at t = s + r ro, so in the picture it is a wave of q = f ro periods per frame height, at the phase
-2 pi f s. A partial flash is nothing of the kind: it comes once a second and only ever adds light.
+Room light on the mains goes as 1 + m cos(2 pi f t) with f twice the line frequency. A row at position r of
+a frame that starts at s sees it at t = s + r ro, so in the picture it is a wave of q = f ro periods per
+frame height, at the phase 2 pi f s. A partial flash is nothing of the kind: it comes once a second and only
+ever adds light.
 """
 
 from __future__ import annotations
@@ -21,8 +22,8 @@ Floats = NDArray[np.float64]
 _DETUNING_HZ = 0.3
 # Waves per frame height: 33 ms of readout at 120 Hz is 4.
 _MOST_WAVES, _WAVE_STEP = 4.5, 0.1
-# At the frame rate the light's frequency appears as an alias. One slower than this is followed by the unlit frames around a
-# pulse, so it does no harm; and a moving camera has its power there.
+# At the frame rate the light's frequency appears as an alias. One slower than this is followed by the unlit
+# frames around a pulse, so it does no harm; and a moving camera has its power there.
 _SLOWEST_ALIAS_HZ = 1.5
 # A wave counts when its amplitude is above this and so many times the usual one of the spectrum.
 _LEAST_DEPTH, _LEAST_RATIO = 0.004, 10.0
@@ -104,7 +105,8 @@ def _find_near(
     frequency = nominal_hz + np.arange(-_DETUNING_HZ, _DETUNING_HZ + step, step)
     spectrum = np.abs(np.exp(-2j * np.pi * frequency[:, None] * time) @ over_rows) / len(time)
     peak = np.unravel_index(int(np.argmax(spectrum)), spectrum.shape)
-    # Without a wave, the spectrum of noise has a Rayleigh distribution: as many cells as here hardly reach 4 medians.
+    # Without a wave, the spectrum of noise has a Rayleigh distribution: as many cells as here hardly reach
+    # 4 medians.
     ratio = float(spectrum[peak] / np.median(spectrum))
     if ratio < _LEAST_RATIO:
         return None
@@ -116,7 +118,13 @@ def _find_near(
 
 
 def _follow(
-    pts_s: Floats, residual: Floats, steady: NDArray[np.bool_], frequency_hz: float, wave: float, rows: int, interval: float
+    pts_s: Floats,
+    residual: Floats,
+    steady: NDArray[np.bool_],
+    frequency_hz: float,
+    wave: float,
+    rows: int,
+    interval: float,
 ) -> tuple[Floats, float]:
     """The wave's gain [K, rows] with slowly changing amplitude and phase, and its mean amplitude."""
     bands = residual.shape[1]

@@ -97,7 +97,9 @@ def _probabilities(
     config: TaggingConfig,
 ) -> tuple[Floats, Floats, Floats]:
     """[P, n] probability of fully lit, of unlit, and expected lit share."""
-    on_full, off_full, off_none, on_none = sharp_limits(readout_s, exposure_s, config.full_lit, config.none_lit)
+    on_full, off_full, off_none, on_none = sharp_limits(
+        readout_s, exposure_s, config.full_lit, config.none_lit
+    )
     full = _until(found.on, on_p, start_s + on_full) * (1 - _until(found.off, off_p, start_s + off_full))
     none = _until(found.off, off_p, start_s + off_none) + 1 - _until(found.on, on_p, start_s + on_none)
     lit = 0.0

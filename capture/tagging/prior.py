@@ -14,7 +14,8 @@ Floats = NDArray[np.float64]
 _TOLERANCE_S = 0.12
 # Fewer matches than this share of the smaller side contradict the prior.
 _LEAST_MATCHED = 0.5
-# Mean pulse lengths farther apart than this are worth a word: a frame or so of latency in switching off is usual.
+# Mean pulse lengths farther apart than this are worth a word: a frame or so of latency in switching off is
+# usual.
 _LENGTH_SLACK_S = 0.05
 _MOST_CANDIDATES = 4000
 
@@ -36,7 +37,9 @@ def check_prior(
     """
     asked = np.sort(np.asarray(prior.times_s, float))
     if not len(asked) or not np.all(np.isfinite(asked)):
-        raise TaggingError(f"The flash times of {prior.source} are empty or not numbers; leave them out or mend them.")
+        raise TaggingError(
+            f"The flash times of {prior.source} are empty or not numbers; leave them out or mend them."
+        )
     offset = _best_offset(asked, on_s)
     partner = np.array([_nearest(asked + offset, t) for t in on_s])
     late = on_s - (asked + offset)[partner]
@@ -46,8 +49,10 @@ def check_prior(
     matched = len(set(partner[near].tolist()))
     if matched < _LEAST_MATCHED * max(expected, len(on_s)):
         raise TaggingError(
-            f"{prior.source} has {expected} pulses in this sequence and the frames show {len(on_s)}, of which only {matched} "
-            f"fit within {1e3 * _TOLERANCE_S:.0f} ms at any offset; it belongs to another recording, leave it out."
+            f"{prior.source} has {expected} pulses in this sequence and the frames show {len(on_s)}, of "
+            f"which only {matched} "
+            f"fit within {1e3 * _TOLERANCE_S:.0f} ms at any offset; it belongs to another recording, leave "
+            "it out."
         )
     offset += float(np.median(late[near]))
     late = on_s[near] - (asked + offset)[partner[near]]
@@ -65,16 +70,19 @@ def _warnings(prior: FlashPrior, check: PriorCheck, on_s: Floats, off_s: Floats)
     out = []
     if check.missing_s:
         out.append(
-            f"{len(check.missing_s)} pulses of {prior.source} are not in the frames (first at {check.missing_s[0]:.2f} s)."
+            f"{len(check.missing_s)} pulses of {prior.source} are not in the frames (first at "
+            f"{check.missing_s[0]:.2f} s)."
         )
     if check.extra_s:
         out.append(
-            f"{len(check.extra_s)} pulses in the frames are not in {prior.source} (first at {check.extra_s[0]:.2f} s)."
+            f"{len(check.extra_s)} pulses in the frames are not in {prior.source} (first at "
+            f"{check.extra_s[0]:.2f} s)."
         )
     length = float(np.median(off_s - on_s))
     if prior.on_s is not None and abs(length - prior.on_s) > _LENGTH_SLACK_S:
         out.append(
-            f"Pulses are {1e3 * length:.0f} ms long in the frames and {1e3 * prior.on_s:.0f} ms in {prior.source}."
+            f"Pulses are {1e3 * length:.0f} ms long in the frames and {1e3 * prior.on_s:.0f} ms in "
+            f"{prior.source}."
         )
     return out
 
@@ -82,11 +90,13 @@ def _warnings(prior: FlashPrior, check: PriorCheck, on_s: Floats, off_s: Floats)
 def _best_offset(asked: Floats, seen: Floats) -> float:
     """The offset that brings most pulses near a command.
 
-    Every pair gives a candidate. Regular commands leave the offset open by whole periods when an end is not seen; among
-    offsets that do equally well (to a hundredth of a second) the smallest is taken.
+    Every pair gives a candidate. Regular commands leave the offset open by whole periods when an end is not
+    seen; among offsets that do equally well (to a hundredth of a second) the smallest is taken.
     """
     candidates = (seen[:, None] - asked[None]).ravel()
-    if len(candidates) > _MOST_CANDIDATES:  # a long recording: its first pulses give every offset there can be
+    if (
+        len(candidates) > _MOST_CANDIDATES
+    ):  # a long recording: its first pulses give every offset there can be
         candidates = (seen[: max(_MOST_CANDIDATES // len(asked), 3), None] - asked[None]).ravel()
 
     def merit(offset: float) -> tuple[int, int, float]:

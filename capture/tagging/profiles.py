@@ -1,12 +1,14 @@
 """What is remembered of every frame: a thumbnail that keeps the sensor's rows apart, and its colour.
 
-A frame costs well under a millisecond and 15 kB, so a whole video is looked at while it is decoded. Thumbnails are not
-cropped, rotated or registered: row y of the thumbnail is a band of sensor rows, read out at its own time.
+A frame costs well under a millisecond and 15 kB, so a whole video is looked at while it is decoded.
+Thumbnails are not cropped, rotated or registered: row y of the thumbnail is a band of sensor rows, read out
+at its own time.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -16,12 +18,14 @@ from capture.errors import TaggingError
 from capture.tagging.config import TaggingConfig
 from capture.transfer import canonical_transfer, to_linear
 
-#: Thumbnail size. 96 bands resolve a readout of 10 to 33 ms to 0.1-0.35 ms; 160 columns are enough to follow the
+#: Thumbnail size. 96 bands resolve a readout of 10 to 33 ms to 0.1-0.35 ms; 160 columns are enough to
+#: follow the
 #: picture's motion to a fraction of a cell.
 THUMBNAIL_ROWS, THUMBNAIL_COLUMNS = 96, 160
 #: Blocks a side of the colour averages.
 COLOR_BLOCKS = 8
-#: Added to linear light before a ratio is taken: half a code of 8-bit sRGB in the shadows (1/255/12.92/2 = 1.5e-4) and the
+#: Added to linear light before a ratio is taken: half a code of 8-bit sRGB in the shadows (1/255/12.92/2
+#: = 1.5e-4) and the
 #: camera's black-level error (about 1e-3) are then not mistaken for gain.
 BLACK_FLOOR = 2e-3
 
@@ -103,8 +107,8 @@ class ProfileAccumulator:
             width: of the frames, pixels.
             height: of the frames, pixels; rows as the sensor has them.
             transfer: name of the transfer function (see `capture.transfer`).
-            levels: stored values of black and white; (16, 235) for 8-bit limited-range luma. Default: the full range of
-                the frames' type.
+            levels: stored values of black and white; (16, 235) for 8-bit limited-range luma. Default: the
+                full range of the frames' type.
             matrix: of the Y'CbCr planes when `chroma` is given: bt601, bt709 or bt2020.
             config: of the tagger; `clip_display` is used.
 
@@ -114,7 +118,8 @@ class ProfileAccumulator:
         """
         if height < 16 or width < 16:
             raise TaggingError(
-                f"Frames of {width}x{height} are too small to see a rolling shutter; at least 16x16 are needed."
+                f"Frames of {width}x{height} are too small to see a rolling shutter; at least 16x16 are "
+                "needed."
             )
         if matrix not in _LUMA_WEIGHTS:
             raise ValueError(f"matrix {matrix!r} is not one of {', '.join(_LUMA_WEIGHTS)}")
@@ -140,7 +145,8 @@ class ProfileAccumulator:
         Args:
             frame: [H, W] luma or [H, W, 3] RGB, display-referred; uint8, uint16, or floating 0..1.
             pts_s: presentation time, later than the frame before.
-            chroma: the frame's Cb and Cr planes in the luma's type, at any subsampling; lets white balance be watched.
+            chroma: the frame's Cb and Cr planes in the luma's type, at any subsampling; lets white balance
+                be watched.
 
         Raises:
             TaggingError: wrong size, or a time that is not later than the one before.
@@ -182,8 +188,8 @@ class ProfileAccumulator:
         )
 
     def _code(self, display: NDArray[np.float32] | np.float32) -> NDArray[np.float32] | np.float32:
-        """0..1 value whose 8-bit rounding is kept: the display value, or its square root for linear sources, whose
-        shadows 256 even steps would not resolve.
+        """0..1 value whose 8-bit rounding is kept: the display value, or its square root for linear
+        sources, whose shadows 256 even steps would not resolve.
         """
         return np.sqrt(np.maximum(display, 0)) if self._transfer == "linear" else display
 
@@ -195,11 +201,11 @@ class ProfileAccumulator:
     def _range(self, dtype: np.dtype[np.generic]) -> tuple[float, float]:
         if self._levels is not None:
             return self._levels
-        return 0.0, float(np.iinfo(dtype).max) if np.issubdtype(dtype, np.integer) else 1.0
+        return 0.0, float(np.iinfo(str(dtype)).max) if np.issubdtype(dtype, np.integer) else 1.0
 
     def _block_color(self, display: NDArray[np.float32]) -> NDArray[np.float32]:
         linear = to_linear(np.clip(display, 0, 1), self._transfer)
-        return cv2.resize(linear, (COLOR_BLOCKS, COLOR_BLOCKS), interpolation=cv2.INTER_AREA)
+        return _resized(linear, COLOR_BLOCKS, COLOR_BLOCKS)
 
     def _rgb(
         self, luma: NDArray[np.float32], cb: NDArray[np.generic], cr: NDArray[np.generic]
@@ -208,14 +214,15 @@ class ProfileAccumulator:
         n = COLOR_BLOCKS
         black, white = self._range(cb.dtype)
         limited = self._levels is not None and black > 0
-        # Chroma is centred on half the type's range; in limited range it spans 224 of luma's 219 steps (BT.709-6, 4.6).
-        middle = (float(np.iinfo(cb.dtype).max) + 1) / 2 if np.issubdtype(cb.dtype, np.integer) else 0.5
+        # Chroma is centred on half the type's range; in limited range it spans 224 of luma's 219 steps
+        # (BT.709-6, 4.6).
+        middle = (float(np.iinfo(str(cb.dtype)).max) + 1) / 2 if np.issubdtype(cb.dtype, np.integer) else 0.5
         span = (white - black) * (224 / 219 if limited else 1.0)
         blue, red = (
-            (cv2.resize(_shrink(p, 4 * n, 4 * n), (n, n), interpolation=cv2.INTER_AREA).astype(np.float32) - middle) / span
-            for p in (cb, cr)
+            (_resized(_shrink(plane, 4 * n, 4 * n), n, n).astype(np.float32) - middle) / span
+            for plane in (cb, cr)
         )
-        y = cv2.resize(luma, (n, n), interpolation=cv2.INTER_AREA)
+        y = _resized(luma, n, n)
         kr, kb = _LUMA_WEIGHTS[self._matrix]
         r, b = y + 2 * (1 - kr) * red, y + 2 * (1 - kb) * blue
         return np.stack([r, (y - kr * r - kb * b) / (1 - kr - kb), b], axis=-1)
@@ -224,11 +231,19 @@ class ProfileAccumulator:
 def _shrink(image: NDArray[np.generic], columns: int, rows: int) -> NDArray[np.generic]:
     """Area average to [rows, columns].
 
-    Display values are averaged, not light: on a power law both give the same *ratio* between two frames that differ by
-    a gain, and it costs a tenth. Halving first is OpenCV's fast path.
+    Display values are averaged, not light: on a power law both give the same *ratio* between two frames
+    that differ by a gain, and it costs a tenth. Halving first is OpenCV's fast path.
     """
     if image.dtype == np.float64 or image.dtype == np.float16:
         image = image.astype(np.float32)
-    while image.shape[0] >= 4 * rows and image.shape[1] >= 4 * columns and not (image.shape[0] | image.shape[1]) & 1:
-        image = cv2.resize(image, (image.shape[1] // 2, image.shape[0] // 2), interpolation=cv2.INTER_AREA)
-    return cv2.resize(image, (columns, rows), interpolation=cv2.INTER_AREA)
+    while (
+        image.shape[0] >= 4 * rows
+        and image.shape[1] >= 4 * columns
+        and not (image.shape[0] | image.shape[1]) & 1
+    ):
+        image = _resized(image, image.shape[1] // 2, image.shape[0] // 2)
+    return _resized(image, columns, rows)
+
+
+def _resized(image: NDArray[Any], columns: int, rows: int) -> NDArray[Any]:
+    return np.asarray(cv2.resize(image, (columns, rows), interpolation=cv2.INTER_AREA))

@@ -1,8 +1,9 @@
 """What the frames of a pulse would look like without the flash.
 
-The unlit frames before and after the pulse are brought to each frame's moment along their optical flow and blended. The flow
-is between unlit frames, so the flash cannot disturb it. What remains of the camera's motion (a hand's tremor is no straight
-line) is a small affine shift, found per frame on the fine structure of the picture only, which the smooth flash does not have.
+The unlit frames before and after the pulse are brought to each frame's moment along their optical flow and
+blended. The flow is between unlit frames, so the flash cannot disturb it. What remains of the camera's
+motion (a hand's tremor is no straight line) is a small affine shift, found per frame on the fine structure
+of the picture only, which the smooth flash does not have.
 """
 
 from __future__ import annotations
@@ -18,7 +19,8 @@ from capture.tagging.profiles import BLACK_FLOOR, THUMBNAIL_COLUMNS, THUMBNAIL_R
 Floats = NDArray[np.float64]
 Image = NDArray[np.float32]
 
-#: Grid on which gains are measured: two thumbnail rows a band, wide columns. Light is summed inside a block before the ratio,
+#: Grid on which gains are measured: two thumbnail rows a band, wide columns. Light is summed inside a
+#: block before the ratio,
 #: so what moves inside a block does not matter.
 BANDS, COLUMNS = 48, 16
 # Rounds of reweighting of the affine fit; it is a small correction to the flow.
@@ -39,8 +41,8 @@ class PulseGain:
         frames: [n] indices of the frames.
         gain: [n, BANDS, COLUMNS] light over reference, minus 1.
         doubt: [BANDS, COLUMNS] standard deviation of the gain, from the disagreement of the two sides.
-        slope: [BANDS, COLUMNS] change of the log reference from one band to the next: a vertical misfit of the reference
-            makes an error of this shape in all columns at once.
+        slope: [BANDS, COLUMNS] change of the log reference from one band to the next: a vertical misfit of
+            the reference makes an error of this shape in all columns at once.
     """
 
     frames: NDArray[np.int_]
@@ -57,11 +59,12 @@ class Reference:
 
         Args:
             profiles: the sequence.
-            row_gain: [K, THUMBNAIL_ROWS] gain of the room light per frame and row (mains flicker); None = constant.
+            row_gain: [K, THUMBNAIL_ROWS] gain of the room light per frame and row (mains flicker); None =
+                constant.
         """
         self._profiles = profiles
         self._row_gain = row_gain
-        self._flow = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
+        self._flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
         # thumbnails are small: one octave finer than the preset's default
         self._flow.setFinestScale(1)
 
@@ -77,7 +80,8 @@ class Reference:
             raise ValueError("a reference needs an unlit frame on one side at least")
         left = before if before is not None else after
         right = after if after is not None else before
-        assert left is not None and right is not None
+        assert left is not None
+        assert right is not None
         a, b = self._unlit(left), self._unlit(right)
         forward, backward = self._motion(left, right)
         t = self._profiles.pts_s
@@ -119,14 +123,17 @@ class Reference:
         codes = self._profiles.codes[[left, right]].astype(np.float32)
         low, high = np.quantile(codes, [0.01, 0.99])  # full contrast also in a dark room
         a, b = np.clip((codes - low) * (255 / max(high - low, 8.0)), 0, 255).astype(np.uint8)
-        return self._flow.calc(a, b, None), self._flow.calc(b, a, None)
+        flow = np.zeros((2, THUMBNAIL_ROWS, THUMBNAIL_COLUMNS, 2), np.float32)
+        self._flow.calc(a, b, flow[0])
+        self._flow.calc(b, a, flow[1])
+        return flow[0], flow[1]
 
 
 def _warp(picture: Image, flow: Image) -> Image:
     """The picture's values at each cell plus its flow.
 
-    Cubic, because linear interpolation smooths the texture away, differently for each flow; where cubic overshoots below
-    black, black.
+    Cubic, because linear interpolation smooths the texture away, differently for each flow; where cubic
+    overshoots below black, black.
     """
     warped = cv2.remap(
         picture, _X + flow[..., 0], _Y + flow[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
@@ -135,17 +142,23 @@ def _warp(picture: Image, flow: Image) -> Image:
 
 
 def _blocks(picture: NDArray[np.floating]) -> Floats:
-    return cv2.resize(picture.astype(np.float32), (COLUMNS, BANDS), interpolation=cv2.INTER_AREA).astype(np.float64)
+    return cv2.resize(picture.astype(np.float32), (COLUMNS, BANDS), interpolation=cv2.INTER_AREA).astype(
+        np.float64
+    )
 
 
 def _affine_motion(difference: Image, log_reference: Image) -> Image:
     """The small affine motion of the reference that explains a log difference best: [h, w, 2] cells.
 
-    Linear in the six parameters: the motion times the reference's gradient. Both sides are high-passed, which takes out the
-    flash (smooth over cells) and leaves the texture; weights 1 / (1 + (r/2s)^2) (Cauchy) keep out what moves otherwise.
+    Linear in the six parameters: the motion times the reference's gradient. Both sides are high-passed,
+    which takes out the flash (smooth over cells) and leaves the texture; weights 1 / (1 + (r/2s)^2)
+    (Cauchy) keep out what moves otherwise.
     """
     smooth = cv2.GaussianBlur(log_reference, (0, 0), 0.7)
-    gx, gy = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, scale=1 / 8), cv2.Sobel(smooth, cv2.CV_32F, 0, 1, scale=1 / 8)
+    gx, gy = (
+        cv2.Sobel(smooth, cv2.CV_32F, 1, 0, scale=1 / 8),
+        cv2.Sobel(smooth, cv2.CV_32F, 0, 1, scale=1 / 8),
+    )
     x, y = _X / THUMBNAIL_COLUMNS - 0.5, _Y / THUMBNAIL_ROWS - 0.5
     basis = np.stack([gx, gy, x * gx, y * gx, x * gy, y * gy])
     fine = np.stack([_high_pass(layer) for layer in basis]).reshape(6, -1)

@@ -10,7 +10,8 @@ class FlashPrior:
     """What is known beforehand of the flash: a schedule, a log of commands. It is checked, not believed.
 
     Attributes:
-        times_s: when the flash was asked to go on; their common offset to the frames' times need not be known.
+        times_s: when the flash was asked to go on; their common offset to the frames' times need not be
+            known.
         on_s: for how long, None = not known.
         source: where that comes from, for messages.
     """
@@ -28,8 +29,8 @@ class FrameTag:
         flash: 1 = every row fully lit, 0 = no row lit, None = in part, or not known.
         lit_fraction: mean share of the pulse's light over the rows, 0..1; None where nothing can be said.
         confidence: probability that the label is right; of None, that the frame is neither lit nor unlit.
-        reasons: remarks, and why a frame is left out: `partial_flash`, `flash_uncertain` (an edge may touch it), `drift`,
-            `clipped`, `clipped_frame`, `dropped_before`, `unreadable`.
+        reasons: remarks, and why a frame is left out: `partial_flash`, `flash_uncertain` (an edge may touch
+            it), `drift`, `clipped`, `clipped_frame`, `dropped_before`, `unreadable`.
     """
 
     flash: int | None
@@ -66,7 +67,8 @@ class PriorCheck:
     """How a prior compares with the pulses that were seen.
 
     Attributes:
-        offset_s: what to add to the prior's times to come to the frames' time: clock offset and the flash's latency.
+        offset_s: what to add to the prior's times to come to the frames' time: clock offset and the flash's
+            latency.
         jitter_s: robust standard deviation of the pulses about that.
         matched: number of pulses that the prior knows.
         missing_s: times, on the frames' axis, at which the prior has a pulse and the frames have none.

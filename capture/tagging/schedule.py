@@ -1,7 +1,9 @@
-"""The rhythm of the pulses: a free period, missed and extra pulses, and what regular neighbours say of an edge.
+"""The rhythm of the pulses: a free period, missed and extra pulses, and what regular neighbours say of an
+edge.
 
-Android's timers wait a fixed time *after* the last firing, so lateness adds up and no line t0 + n T fits for long; a
-microcontroller's do not. Both are a random walk of the pulses' lateness, with a small step or a large one.
+Android's timers wait a fixed time *after* the last firing, so lateness adds up and no line t0 + n T fits
+for long; a microcontroller's do not. Both are a random walk of the pulses' lateness, with a small step or a
+large one.
 """
 
 from __future__ import annotations
@@ -19,15 +21,17 @@ Floats = NDArray[np.float64]
 
 # A pulse belongs to the rhythm when it is off by less than this share of the period: a phone's worst jank.
 _TOLERANCE = 0.12
-# In the chain's score a missed pulse costs this much of a found one: half the period explains all pulses too, but misses
-# every other one; the double period finds only half of them.
+# In the chain's score a missed pulse costs this much of a found one: half the period explains all pulses
+# too, but misses every other one; the double period finds only half of them.
 _MISSED_COST = 0.4
-# Scales of the random walk's step that are tried, seconds: a microcontroller's timer to a phone's busy user interface.
+# Scales of the random walk's step that are tried, seconds: a microcontroller's timer to a phone's busy user
+# interface.
 _STEPS_S = np.geomspace(1e-4, 0.03, 8)
 # Floor of a neighbours' density against its peak: what they say is never taken for certain.
 _LEAST_DENSITY = 1e-6
-# Share of steps that follow no rule at all (a phone that hangs).
-_LAWLESS = 1e-3
+# Lateness has heavy tails: so many steps are so many times larger, and some follow no rule at all (a phone
+# that hangs).
+_LARGE_SHARE, _LARGE_FACTOR, _LAWLESS = 0.15, 6.0, 0.01
 # Pulses from which step and period are learnt.
 _MOST_PULSES = 60
 
@@ -95,7 +99,8 @@ def _candidate_periods(time_s: Floats, config: TaggingConfig) -> list[float]:
 
 
 def _longest_chain(time_s: Floats, period_s: float) -> tuple[float, NDArray[np.int_]]:
-    """Best sequence of pulses whose steps are whole periods (dynamic programming): its score and its members."""
+    """Best sequence of pulses whose steps are whole periods (dynamic programming): its score and its
+    members."""
     count = len(time_s)
     score, before = np.ones(count), np.full(count, -1)
     for i in range(1, count):
@@ -116,11 +121,12 @@ def _longest_chain(time_s: Floats, period_s: float) -> tuple[float, NDArray[np.i
 
 
 def neighbours_log_prior(curve: EdgeCurve, cycle: NDArray[np.int_], period_s: float) -> Floats:
-    """What the other pulses say of each edge's time: [P, G] log density on the curve's grid, leaving the pulse itself out.
+    """What the other pulses say of each edge's time: [P, G] log density on the curve's grid, leaving the
+    pulse itself out.
 
-    The lateness u = t - n T is a random walk over the cycles n; forward and backward messages of the walk (Rabiner 1989)
-    meet at each pulse. The step is averaged over, so an irregular flash gives a wide density and a regular one a sharp
-    density, also where all edges fall into the gap between two frames.
+    The lateness u = t - n T is a random walk over the cycles n; forward and backward messages of the walk
+    (Rabiner 1989) meet at each pulse. The step is averaged over, so an irregular flash gives a wide density
+    and a regular one a sharp density, also where all edges fall into the gap between two frames.
     """
     log_prior = np.zeros_like(curve.log)
     known = np.flatnonzero(cycle >= 0)
@@ -163,7 +169,10 @@ class _Walk:
                 method="bounded",
                 options={"maxiter": 10, "xatol": 0.3 * step_s / span},
             )
-            found.append((-float(best.fun), float(best.x), float(step_s)))
+            # The likelihood integrated over the period, not its peak: a regular flash fits only a narrow
+            # range of periods, and what a few pulses do by chance must not count as regular.
+            width = float(np.log(step_s / np.sqrt(span)))
+            found.append((-float(best.fun) + width, float(best.x), float(step_s)))
         highest = max(found)[0]
         weights = [float(np.exp(value - highest)) for value, _, _ in found]
         return [
@@ -204,7 +213,10 @@ class _Walk:
             if place:
                 periods = abs(int(self._cycle[i] - self._cycle[order[place - 1]]))
                 spread = step_s * np.sqrt(periods) / spacing
-                message = (1 - _LAWLESS) * ndimage.gaussian_filter1d(belief, spread, mode="constant") + _LAWLESS * flat
+                usual = ndimage.gaussian_filter1d(belief, spread, mode="constant")
+                large = ndimage.gaussian_filter1d(usual, _LARGE_FACTOR * spread, mode="constant", truncate=3)
+                message = (1 - _LARGE_SHARE) * usual + _LARGE_SHARE * large
+                message = (1 - _LAWLESS) * message + _LAWLESS * flat
             messages.append(message)
             late = self._time[i] - self._cycle[i] * period_s - self._origin
             belief = message * np.diff(np.interp(borders, late, self._mass[i])) / spacing + 1e-30

@@ -19,7 +19,8 @@ from capture.tagging.tagger import tag
 
 # Frames at least so often are a video, in which pulses have edges; fewer are stills.
 _VIDEO_HZ = 12.0
-# Stills have no time; the split gets them at this pace, which makes a still's nearest neighbours its reference.
+# Stills have no time; the split gets them at this pace, which makes a still's nearest neighbours its
+# reference.
 _STILL_INTERVAL_S = 1 / 6
 # Scores between these are neither lit nor unlit.
 _UNLIT, _LIT = 0.3, 0.7
@@ -48,7 +49,9 @@ def tag_frames(
     accumulator: ProfileAccumulator | None = None
     for picture, pts_s in frames:
         if accumulator is None:
-            accumulator = ProfileAccumulator(picture.shape[1], picture.shape[0], transfer=transfer, config=config)
+            accumulator = ProfileAccumulator(
+                picture.shape[1], picture.shape[0], transfer=transfer, config=config
+            )
         accumulator.add(picture, pts_s)
     if accumulator is None:
         raise TaggingError("There are no frames to tag; give at least 8, with and without flash.")
@@ -58,14 +61,17 @@ def tag_frames(
 def tag_session(session: Session, *, config: TaggingConfig | None = None) -> list[FrameRecord]:
     """The records of a session with the flash filled in where it was unknown; nothing is written.
 
-    A session of a video (many frames a second, all with their pictures) is tagged as one. Stills in the order in which they
-    were taken are split by their light against their neighbours'; there are no rows' times to see a partial flash by.
+    A session of a video (many frames a second, all with their pictures) is tagged as one. Stills in the
+    order in which they were taken are split by their light against their neighbours'; there are no rows'
+    times to see a partial flash by.
 
     Raises:
         TaggingError: the classes cannot be told apart.
     """
     config = config or TaggingConfig()
-    kept = [record for record in session.frames if record.file is not None and "unreadable" not in record.reasons]
+    kept = [
+        record for record in session.frames if record.file is not None and "unreadable" not in record.reasons
+    ]
     if all(record.flash is not None for record in kept):
         return session.frames
     transfer = str(session.info["image"]["transfer"])
@@ -74,13 +80,21 @@ def tag_session(session: Session, *, config: TaggingConfig | None = None) -> lis
     times = np.array([np.nan if record.pts_s is None else record.pts_s for record in kept])
     video = len(kept) > 1 and bool(np.all(np.diff(times) > 0)) and np.median(np.diff(times)) <= 1 / _VIDEO_HZ
     for number, record in enumerate(kept):
-        accumulator.add(session.load_image(record), float(times[number]) if video else _STILL_INTERVAL_S * number)
-    tagged = _tag_video(kept, accumulator.profiles(), config) if video else _tag_stills(kept, accumulator.profiles(), config)
+        accumulator.add(
+            session.load_image(record), float(times[number]) if video else _STILL_INTERVAL_S * number
+        )
+    tagged = (
+        _tag_video(kept, accumulator.profiles(), config)
+        if video
+        else _tag_stills(kept, accumulator.profiles(), config)
+    )
     known = {old.index: new if old.flash is None else old for old, new in zip(kept, tagged, strict=True)}
     return [known.get(record.index, record) for record in session.frames]
 
 
-def _tag_video(records: list[FrameRecord], profiles: FrameProfiles, config: TaggingConfig) -> list[FrameRecord]:
+def _tag_video(
+    records: list[FrameRecord], profiles: FrameProfiles, config: TaggingConfig
+) -> list[FrameRecord]:
     return [
         replace(
             record,
@@ -93,7 +107,9 @@ def _tag_video(records: list[FrameRecord], profiles: FrameProfiles, config: Tagg
     ]
 
 
-def _tag_stills(records: list[FrameRecord], profiles: FrameProfiles, config: TaggingConfig) -> list[FrameRecord]:
+def _tag_stills(
+    records: list[FrameRecord], profiles: FrameProfiles, config: TaggingConfig
+) -> list[FrameRecord]:
     split = split_frames(profiles.pts_s, profiles.blocks(BLOCKS, BLOCKS), config, most_lit=_MOST_LIT)
     out = []
     for record, score in zip(records, split.score, strict=True):

@@ -1,13 +1,13 @@
 """The rolling shutter's view of a light that goes on and off.
 
 Row position r (0 = top edge of the picture, 1 = bottom edge) of a frame that starts at s is exposed during
-[s + offset(r), s + offset(r) + e] with offset(r) = r ro for a readout ro >= 0 and (1 - r) |ro| for ro < 0 (bottom row
-first). Of a light that is on during [t_on, t_off] it gets the share
+[s + offset(r), s + offset(r) + e] with offset(r) = r ro for a readout ro >= 0 and (1 - r) |ro| for ro < 0
+(bottom row first). Of a light that is on during [t_on, t_off] it gets the share
 
     a(r) = after(t_on) - after(t_off),    after(t) = clip((s + offset(r) + e - t) / e, 0, 1),
 
-the part of the exposure after the one edge less the part after the other. `after` is piecewise linear in r, so its mean
-over a band of rows is exact in closed form.
+the part of the exposure after the one edge less the part after the other. `after` is piecewise linear in r,
+so its mean over a band of rows is exact in closed form.
 """
 
 from __future__ import annotations
@@ -18,7 +18,9 @@ from numpy.typing import ArrayLike, NDArray
 Floats = NDArray[np.float64]
 
 
-def share_after(start_s: ArrayLike, edge_s: ArrayLike, readout_s: float, exposure_s: float, bands: int) -> Floats:
+def share_after(
+    start_s: ArrayLike, edge_s: ArrayLike, readout_s: float, exposure_s: float, bands: int
+) -> Floats:
     """Mean share of the exposure that comes after an edge, per band of rows.
 
     Args:
@@ -39,7 +41,8 @@ def share_after(start_s: ArrayLike, edge_s: ArrayLike, readout_s: float, exposur
     width = readout_s / bands / exposure_s
     if abs(width) < 1e-6:  # all rows at once: the mean is the value, and the quotient below would cancel
         return np.clip(u[..., :-1], 0.0, 1.0)
-    # the mean of clip(u, 0, 1) over a band is the difference of its integral, u^2 / 2 up to 1 and u - 1/2 beyond
+    # the mean of clip(u, 0, 1) over a band is the difference of its integral, u^2 / 2 up to 1 and u - 1/2
+    # beyond
     inside = np.clip(u, 0.0, 1.0)
     u -= 1.0
     integral = np.maximum(u, 0.0, out=u)
@@ -62,7 +65,9 @@ def lit_share(
     )
 
 
-def sharp_limits(readout_s: float, exposure_s: float, full: float, none: float) -> tuple[float, float, float, float]:
+def sharp_limits(
+    readout_s: float, exposure_s: float, full: float, none: float
+) -> tuple[float, float, float, float]:
     """When a frame that starts at 0 is lit in full, or not at all, as limits on the pulse's edges.
 
     Args:

@@ -1,9 +1,9 @@
 """Readout and exposure of a sequence, out of the rolling-shutter patterns of its pulses.
 
-One partially lit frame gives only the ratios readout : exposure : edge time; stretched in time, it looks the same. The
-absolute scale comes from edges seen in two frames, from how often an edge falls between two frames' exposures, where no
-row sees it, and from regular pulses. All three are in the evidence (the likelihood integrated over the edges), so readout
-and exposure are those of the largest evidence.
+One partially lit frame gives only the ratios readout : exposure : edge time; stretched in time, it looks
+the same. The absolute scale comes from edges seen in two frames, from how often an edge falls between two
+frames' exposures, where no row sees it, and from regular pulses. All three are in the evidence (the
+likelihood integrated over the edges), so readout and exposure are those of the largest evidence.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from capture.tagging.edges import EdgeRange, find_edges
 
 Floats = NDArray[np.float64]
 
-# Starts: the span from the first row's start to the last row's end in frame intervals, and the readout's share of it with
-# its sign.
+# Starts: the span from the first row's start to the last row's end in frame intervals, and the readout's
+# share of it with its sign.
 _SPANS = (0.15, 0.3, 0.5, 0.75, 1.0, 1.3)
 _ROLLS = (-0.9, -0.7, -0.4, 0.0, 0.4, 0.7, 0.9)
 # Spans that are tried at the found roll: the evidence has several peaks along it, or none at all.
 _ALL_SPANS = np.geomspace(0.1, 2.0, 36)
-# Rolling shutters of phones take 10 to 33 ms at 30 frames a second: normal in log span. It decides only where nothing else
-# does.
+# Rolling shutters of phones take 10 to 33 ms at 30 frames a second: normal in log span. It decides only
+# where nothing else does.
 _USUAL_SPAN, _USUAL_WIDTH = 0.65, 0.6
 # A hump of the evidence wider than this, in log span, is taken by its mean; it is one step of the spans.
 _SHARP = 0.08
@@ -106,8 +106,12 @@ def fit_shutter(
     return Shutter(
         readout_s=readout_s,
         exposure_s=exposure_s,
-        readout_sigma_s=0.0 if config.readout_s is not None else float(np.hypot(stretch * readout_s, roll * span)),
-        exposure_sigma_s=0.0 if config.exposure_s is not None else float(np.hypot(stretch * exposure_s, roll * span)),
+        readout_sigma_s=0.0
+        if config.readout_s is not None
+        else float(np.hypot(stretch * readout_s, roll * span)),
+        exposure_sigma_s=0.0
+        if config.exposure_s is not None
+        else float(np.hypot(stretch * exposure_s, roll * span)),
         stretch_sigma=0.0 if config.readout_s is not None or config.exposure_s is not None else stretch,
     )
 
@@ -146,7 +150,8 @@ class _Problem:
         """Log evidence; -inf outside what a sensor can do: rows are read and exposed once a frame."""
         readout_s, exposure_s = self.times(x)
         if not (
-            abs(readout_s) <= 1.05 * self._interval_s and _SHORTEST_EXPOSURE_S <= exposure_s <= self._interval_s
+            abs(readout_s) <= 1.05 * self._interval_s
+            and _SHORTEST_EXPOSURE_S <= exposure_s <= self._interval_s
         ):
             return -np.inf
         step_s = float(np.clip(exposure_s / 4, *_EDGE_STEPS_S))
@@ -164,7 +169,9 @@ class _Problem:
             periods = np.diff(n)
             value += max(
                 _regularity(t, variance, [np.ones(len(n)), n]),
-                _regularity(np.diff(t) / periods, (variance[1:] + variance[:-1]) / periods**2, [np.ones(len(periods))]),
+                _regularity(
+                    np.diff(t) / periods, (variance[1:] + variance[:-1]) / periods**2, [np.ones(len(periods))]
+                ),
             )
         return value
 
@@ -182,8 +189,8 @@ class _Problem:
     def stretch(self, x: tuple[float, float]) -> tuple[tuple[float, float], float | None]:
         """The best stretch of the span, and how well it is known; None when there is one sharp peak to climb.
 
-        Where the pulses are irregular the evidence is a wide hump, rough by what the edge search leaves: its mean and width
-        are the answer, not its highest point.
+        Where the pulses are irregular the evidence is a wide hump, rough by what the edge search leaves:
+        its mean and width are the answer, not its highest point.
         """
         logs = np.log(_ALL_SPANS)
         evidence = np.array([self.evidence((value, x[1])) for value in logs])
@@ -201,7 +208,8 @@ class _Problem:
         return (float(logs[np.argmax(evidence)]), x[1]), None
 
     def sigma(self, x: tuple[float, float], axis: int) -> float:
-        """Standard deviation along one parameter: the distance at which the evidence falls, taken for a normal's."""
+        """Standard deviation along one parameter: the distance at which the evidence falls, taken for a
+        normal's."""
         top = self.evidence(x)
         for reach in _REACHES:
             fall = [
@@ -216,7 +224,8 @@ class _Problem:
 
 
 def _regularity(values: Floats, variance: Floats, basis: list[Floats]) -> float:
-    """Log likelihood that measured times are a linear model plus an irregularity, at its most likely scale."""
+    """Log likelihood that measured times are a linear model plus an irregularity, at its most likely
+    scale."""
     columns = np.stack(basis, axis=1)
     best = -np.inf
     for scale in _IRREGULARITIES:

@@ -1,9 +1,9 @@
 """Which frames stand out: a two-class split of the log gain over the local no-flash reference.
 
-A flash adds light nearly everywhere at once, for a short time, with the same spatial pattern every time; camera motion
-raises some blocks and lowers others, with no pattern that comes back. So the score of a frame is its block-wise log gain
-over the unlit frames before and after it, projected on the pattern of the frames found lit so far (a matched filter), and
-pattern and classes are found in turn.
+A flash adds light nearly everywhere at once, for a short time, with the same spatial pattern every time;
+camera motion raises some blocks and lowers others, with no pattern that comes back. So the score of a frame
+is its block-wise log gain over the unlit frames before and after it, projected on the pattern of the frames
+found lit so far (a matched filter), and pattern and classes are found in turn.
 """
 
 from __future__ import annotations
@@ -19,14 +19,17 @@ from capture.tagging.config import TaggingConfig
 
 Floats = NDArray[np.float64]
 
-#: Blocks a side. Wide enough that motion between neighbouring frames stays inside a block, small enough to tell the head
+#: Blocks a side. Wide enough that motion between neighbouring frames stays inside a block, small enough
+#: to tell the head
 #: from the wall behind it.
 BLOCKS = 16
-# Log gains beyond this are motion of a window or a lamp, not flash shape; e^1.5 = 4.5 times still counts in full.
+# Log gains beyond this are motion of a window or a lamp, not flash shape; e^1.5 = 4.5 times still counts in
+# full.
 _LARGEST_LOG_GAIN = 1.5
 # Rounds of finding pattern and classes, at most; in the first the classes are still unknown to the reference.
 _ROUNDS, _BLIND_ROUNDS = 14, 3
-# Log gain that quantisation leaves in a block when nothing moves; keeps still blocks from taking all the weight.
+# Log gain that quantisation leaves in a block when nothing moves; keeps still blocks from taking all the
+# weight.
 _LEAST_NOISE = 1e-3
 # Of a reference: frames on each side. More would average noise but reach further into the camera's motion.
 _SIDE = 3
@@ -77,7 +80,8 @@ def split_frames(
     log = np.log(blocks.astype(np.float64)).reshape(count, -1)
     gain = np.clip(_symmetric_gain(pts_s, log, config), -_LARGEST_LOG_GAIN, _LARGEST_LOG_GAIN)
     noise = _spread(gain) + _LEAST_NOISE
-    # Before the pattern is known: how many blocks rise together, each counted in its own noise and at most twice.
+    # Before the pattern is known: how many blocks rise together, each counted in its own noise and at most
+    # twice.
     score = np.clip(gain / noise, -2, 2).mean(axis=1)
     core = _brief(pts_s, score > otsu_threshold(score), config)
     pattern = np.zeros(log.shape[1])
@@ -117,7 +121,8 @@ def _checked(
     if core.any() and away.sum() >= 4 and weight.any():
         middle = float(np.median(score[away]))
         scatter = np.abs(score[away] - middle)
-        # the larger of the bulk's and the tail's spread: motion has heavy tails (2.17 = normal quantile of 98.5 %)
+        # the larger of the bulk's and the tail's spread: motion has heavy tails (2.17 = normal quantile of
+        # 98.5 %)
         spread = max(1.4826 * float(np.median(scatter)), float(np.quantile(scatter, 0.97)) / 2.17, 1e-4)
         lit = float(np.median(score[core]))
         separation = (lit - middle) / spread
@@ -128,12 +133,14 @@ def _checked(
     if separation < config.min_separation or log_gain < _LEAST_LOG_GAIN:
         raise TaggingError(
             f"The frames do not fall into lit and unlit ones (separation {separation:.1f}, at least "
-            f"{config.min_separation:g} needed; gain {100 * np.expm1(log_gain):.1f} %): the flash was always off or always "
+            f"{config.min_separation:g} needed; gain {100 * np.expm1(log_gain):.1f} %): the flash was "
+            "always off or always "
             "on, or it is too weak for the room; check it, darken the room or come closer, and record again."
         )
     if share > most_lit:
         raise TaggingError(
-            f"{100 * share:.0f} % of the frames look lit, more than the {100 * most_lit:.0f} % of any blinking flash; "
+            f"{100 * share:.0f} % of the frames look lit, more than the {100 * most_lit:.0f} % of any "
+            "blinking flash; "
             "this is a change of the room light, not a flash."
         )
     scale = lit - middle
@@ -159,7 +166,8 @@ def _brief(pts_s: Floats, lit: NDArray[np.bool_], config: TaggingConfig) -> NDAr
 
 
 def otsu_threshold(values: Floats) -> float:
-    """The threshold that maximises the variance between two classes (Otsu 1979), over the sorted values themselves."""
+    """The threshold that maximises the variance between two classes (Otsu 1979), over the sorted values
+    themselves."""
     ordered = np.sort(values)
     n = len(ordered)
     below = np.cumsum(ordered)[:-1]
@@ -175,7 +183,8 @@ def _spread(values: Floats) -> Floats:
 
 
 def _symmetric_gain(pts_s: Floats, log: Floats, config: TaggingConfig) -> Floats:
-    """[K, N] log gain over the median of symmetric pairs of neighbours: a steady trend cancels, classes unknown yet."""
+    """[K, N] log gain over the median of symmetric pairs of neighbours: a steady trend cancels, classes
+    unknown yet."""
     count = len(pts_s)
     interval = float(np.median(np.diff(pts_s)))
     nearest = max(1, round(0.1 / interval))
@@ -201,9 +210,11 @@ def _local_gain(pts_s: Floats, log: Floats, unlit: NDArray[np.bool_]) -> Floats:
     first_after = np.searchsorted(index, k + 2)
     last_before = np.searchsorted(index, k - 2, side="right") - 1
     reach = np.arange(_SIDE)
-    place = np.concatenate([last_before[:, None] - reach, first_after[:, None] + reach], axis=1)  # [K, 2 SIDE]
-    there = (place >= 0) & (place < len(index))
-    alone = ~(there[:, :_SIDE].any(axis=1) & there[:, _SIDE:].any(axis=1))
+    place = np.concatenate(
+        [last_before[:, None] - reach, first_after[:, None] + reach], axis=1
+    )  # [K, 2 SIDE]
+    there: NDArray[np.bool_] = np.asarray((place >= 0) & (place < len(index)))
+    alone: NDArray[np.bool_] = np.asarray(~(there[:, :_SIDE].any(axis=1) & there[:, _SIDE:].any(axis=1)))
     there[alone[:, None] & (np.tile(reach, 2) >= 2)] = False
     near = index[np.clip(place, 0, len(index) - 1)]
     count = np.maximum(there.sum(axis=1, keepdims=True), 1)

@@ -2,10 +2,13 @@
 
 1. mains flicker of the room light is found and taken out (`flicker`),
 2. frames are split into lit and unlit (`split`); no two classes, no tags,
-3. around each pulse the gain over the motion-compensated unlit frames is measured (`windows`, `reference`, `bands`),
+3. around each pulse the gain over the motion-compensated unlit frames is measured (`windows`, `reference`,
+   `bands`),
 4. readout and exposure are fitted for the sequence, the edges for each pulse (`shutter_fit`, `edges`),
-5. labels follow from the edges and their rhythm, and are checked against the light that was measured (`labels`),
-6. what is left is said of single frames and of the sequence: clipping, drift, gaps, a schedule that does not fit.
+5. labels follow from the edges and their rhythm, and are checked against the light that was measured
+   (`labels`),
+6. what is left is said of single frames and of the sequence: clipping, drift, gaps, a schedule that does
+   not fit.
 """
 
 from __future__ import annotations
@@ -37,15 +40,15 @@ Flags = NDArray[np.bool_]
 
 # Frames farther apart than this many usual intervals have others missing between them.
 _GAP = 1.5
-# Light that differs from what the edges say by more than this share of the pulse, beyond twice its noise, is not believed:
-# a lamp still rising, or something that is no pulse. Less is droop.
+# Light that differs from what the edges say by more than this share of the pulse, beyond twice its noise,
+# is not believed: a lamp still rising, or something that is no pulse. Less is droop.
 _DIM, _GLOW = 0.07, 0.05
 # A candidate without any mostly lit frame must have this share of the usual pulse's light.
 _LEAST_GAIN = 0.3
 # A blinking flash gives at least this share of the pulses that the longest period allows.
 _LEAST_PULSES = 0.4
-# The pulses' patterns over the picture agree when their correlation is above the first; chance patterns of motion have
-# nothing in common. One pulse that does not fit the others, below the second, is another light.
+# The pulses' patterns over the picture agree when their correlation is above the first; chance patterns of
+# motion have nothing in common. One pulse that does not fit the others, below the second, is another light.
 _AGREEMENT, _LEAST_AGREEMENT = 0.25, 0.1
 _PATTERN_BLOCKS = 8
 # A flicker with fewer waves over the rows does not measure the readout.
@@ -71,13 +74,15 @@ def tag(
         A tag for each frame, the pulses, and what was learnt of the shutter and the rhythm.
 
     Raises:
-        TaggingError: no flash, a flash that is always on, too few frames, or a schedule that contradicts the frames.
+        TaggingError: no flash, a flash that is always on, too few frames, or a schedule that contradicts
+            the frames.
     """
     config = config or TaggingConfig()
     seen = np.flatnonzero(profiles.readable)
     if len(seen) < 8:
         raise TaggingError(
-            f"Only {len(seen)} of {len(profiles)} frames can be used; at least 8, with and without flash, are needed."
+            f"Only {len(seen)} of {len(profiles)} frames can be used; at least 8, with and without flash, "
+            "are needed."
         )
     readable = profiles.take(seen)
     split, flicker, blocks = _split(readable, config)
@@ -106,7 +111,9 @@ class _Found:
     rhythm: Rhythm | None
 
 
-def _split(profiles: FrameProfiles, config: TaggingConfig) -> tuple[Split, Flicker | None, NDArray[np.float32]]:
+def _split(
+    profiles: FrameProfiles, config: TaggingConfig
+) -> tuple[Split, Flicker | None, NDArray[np.float32]]:
     """Lit and unlit frames, with the room's flicker taken out of the unlit part where there is any."""
     blocks = profiles.blocks(BANDS, BLOCKS)
     rows = np.log(blocks).mean(axis=2).astype(float)
@@ -116,7 +123,7 @@ def _split(profiles: FrameProfiles, config: TaggingConfig) -> tuple[Split, Flick
     usual = 1.4826 * np.median(np.abs(stands_out)) + 1e-6
     flicker = find_flicker(profiles.pts_s, rows, np.abs(stands_out) < 4 * usual, BANDS, config)
     if flicker is not None:
-        blocks = blocks / flicker.row_gain[:, :, None].astype(np.float32)
+        blocks = np.asarray(blocks / flicker.row_gain[:, :, None], np.float32)
     square = blocks.reshape(len(profiles), BLOCKS, BANDS // BLOCKS, BLOCKS).mean(axis=2)
     split = split_frames(profiles.pts_s, square, config)
     if flicker is not None:  # again, from the frames that are unlit, for the rows of the thumbnails
@@ -166,7 +173,8 @@ def _credible(
     if len(strong) < max(due, 1):
         raise TaggingError(
             f"Only {len(strong)} pulses of light were found in {duration_s:.1f} s; a flash that blinks every "
-            f"{config.shortest_period_s:g} to {config.longest_period_s:g} s gives at least {int(np.ceil(due))}. Check that "
+            f"{config.shortest_period_s:g} to {config.longest_period_s:g} s gives at least "
+            f"{int(np.ceil(due))}. Check that "
             "it blinked, and that it is bright enough for the room."
         )
     maps = np.array([_map(w, g) for w, g in zip(windows, gains, strict=True)])
@@ -178,8 +186,10 @@ def _credible(
     usual = float(np.median(agreement[strong]))
     if usual < _AGREEMENT:
         raise TaggingError(
-            f"The {len(strong)} bright moments found have no pattern in common (correlation {usual:.2f}, at least "
-            f"{_AGREEMENT} needed): they are motion or other lights, not one flash. Check that the flash blinked, and "
+            f"The {len(strong)} bright moments found have no pattern in common (correlation {usual:.2f}, "
+            "at least "
+            f"{_AGREEMENT} needed): they are motion or other lights, not one flash. Check that the flash "
+            "blinked, and "
             "that it is bright enough for the room."
         )
     return [bool(a >= _LEAST_AGREEMENT) for a in agreement]
@@ -190,11 +200,17 @@ def _map(window: PulseWindow, gain: PulseGain) -> Floats:
     lit = gain.gain[window.first - window.begin : window.last + 1 - window.begin]
     # one passing lamp must not make the pattern
     middle = np.clip(np.median(lit, axis=0), -0.5, 3.0).astype(np.float32)
-    small = cv2.resize(middle, (_PATTERN_BLOCKS, _PATTERN_BLOCKS), interpolation=cv2.INTER_AREA).astype(float).ravel()
+    small = (
+        cv2.resize(middle, (_PATTERN_BLOCKS, _PATTERN_BLOCKS), interpolation=cv2.INTER_AREA)
+        .astype(float)
+        .ravel()
+    )
     return small / (np.linalg.norm(small) + 1e-9)
 
 
-def _frame_labels(profiles: FrameProfiles, split: Split, found: _Found, config: TaggingConfig) -> list[FrameTag]:
+def _frame_labels(
+    profiles: FrameProfiles, split: Split, found: _Found, config: TaggingConfig
+) -> list[FrameTag]:
     """Tags of the readable frames, flash only."""
     tags = [_far_label(score, split.spread) for score in split.score]
     for window in found.doubtful:
@@ -244,7 +260,11 @@ def _near_label(
 
 
 def _with_remarks(
-    profiles: FrameProfiles, seen: NDArray[np.int_], frames: list[FrameTag], drift: Drift, config: TaggingConfig
+    profiles: FrameProfiles,
+    seen: NDArray[np.int_],
+    frames: list[FrameTag],
+    drift: Drift,
+    config: TaggingConfig,
 ) -> list[FrameTag]:
     """Tags of all frames, with what is to be said besides the flash."""
     tags = [FrameTag(None, None, 0.0, ("unreadable",))] * len(profiles)
@@ -267,7 +287,8 @@ def _warnings(found: _Found, flicker: Flicker | None, drift: Drift, frames: list
     out = []
     if not any(frame.flash == 1 for frame in frames):
         out.append(
-            "No frame is lit in every row: the pulses are too short for this shutter; make them longer than exposure, "
+            "No frame is lit in every row: the pulses are too short for this shutter; make them longer "
+            "than exposure, "
             "readout and frame interval together."
         )
     if found.rhythm is None:
@@ -275,17 +296,24 @@ def _warnings(found: _Found, flicker: Flicker | None, drift: Drift, frames: list
     else:
         if found.rhythm.missed:
             times = ", ".join(f"{t:.2f}" for t in _missed_times(found)[:5])
-            out.append(f"{len(found.rhythm.missed)} pulses did not come (at {times} s); those frames are without flash.")
+            out.append(
+                f"{len(found.rhythm.missed)} pulses did not come (at {times} s); those frames are without "
+                "flash."
+            )
         extra = int(np.sum(found.rhythm.cycle < 0))
         if extra:
-            out.append(f"{extra} pulses are outside of the rhythm; their frames are tagged by what they show.")
+            out.append(
+                f"{extra} pulses are outside of the rhythm; their frames are tagged by what they show."
+            )
     if found.doubtful:
         out.append(
-            f"{len(found.doubtful)} bright moments do not look like the flash; their frames are left untagged."
+            f"{len(found.doubtful)} bright moments do not look like the flash; their frames are left "
+            "untagged."
         )
     if flicker is not None:
         out.append(
-            f"The room light flickers at {flicker.frequency_hz:.1f} Hz by {100 * flicker.depth:.1f} %; expose for a multiple "
+            f"The room light flickers at {flicker.frequency_hz:.1f} Hz by {100 * flicker.depth:.1f} %; "
+            "expose for a multiple "
             f"of {1e3 / flicker.frequency_hz:.1f} ms, or use daylight."
         )
     return out + drift.warnings()
@@ -297,7 +325,9 @@ def _missed_times(found: _Found) -> list[float]:
     if rhythm is None:
         return []
     known = rhythm.cycle >= 0
-    times = np.interp(np.array(rhythm.missed, float), rhythm.cycle[known].astype(float), found.labels.on_s[known])
+    times = np.interp(
+        np.array(rhythm.missed, float), rhythm.cycle[known].astype(float), found.labels.on_s[known]
+    )
     return [float(t) for t in times]
 
 

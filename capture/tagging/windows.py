@@ -13,10 +13,11 @@ from capture.tagging.split import Split
 
 Floats = NDArray[np.float64]
 
-# Frames on each side of the lit ones that an edge can touch: one by its rows, one more by a readout and an exposure that
-# overlap the next frame's.
+# Frames on each side of the lit ones that an edge can touch: one by its rows, one more by a readout and an
+# exposure that overlap the next frame's.
 _GUARD = 2
-# A score above this share of a full flash and so many spreads may be a pulse that only ever lit parts of frames.
+# A score above this share of a full flash and so many spreads may be a pulse that only ever lit parts of
+# frames.
 _WEAK_SCORE, _WEAK_SPREADS = 0.2, 6.0
 # Edges are searched so far beyond the frames that bracket them, in frame intervals: the score's error.
 _MARGIN = 0.25
@@ -60,7 +61,8 @@ def find_windows(pts_s: Floats, split: Split, config: TaggingConfig) -> list[Pul
     for i, (first, last, is_weak) in enumerate(runs):
         room_before = first - (runs[i - 1][1] + 1) if i else first
         room_after = (runs[i + 1][0] if i + 1 < len(runs) else count) - last - 1
-        # between two pulses their guards and at least one unlit frame must find room; at an end, one unlit frame
+        # between two pulses their guards and at least one unlit frame must find room; at an end, one unlit
+        # frame
         left = min(_GUARD, max((room_before - 1) // (2 if i else 1), 0))
         right = min(_GUARD, max((room_after - 1) // (2 if i + 1 < len(runs) else 1), 0))
         begin, end = first - left, last + right + 1
@@ -78,11 +80,13 @@ def find_windows(pts_s: Floats, split: Split, config: TaggingConfig) -> list[Pul
     return [window for window in windows if window.before is not None or window.after is not None]
 
 
-def edge_range(pts_s: Floats, windows: list[PulseWindow], interval_s: float, config: TaggingConfig) -> EdgeRange:
+def edge_range(
+    pts_s: Floats, windows: list[PulseWindow], interval_s: float, config: TaggingConfig
+) -> EdgeRange:
     """Where the edges of the pulses can lie, by the frames that are mostly lit and those that are not.
 
-    More than half of frame `first` sees the light, so it went on at most an interval after the frame began; less than half
-    of the frame before does, so it went on after that one began.
+    More than half of frame `first` sees the light, so it went on at most an interval after the frame began;
+    less than half of the frame before does, so it went on after that one began.
     """
     margin = _MARGIN * interval_s
     on_low, on_high, off_low, off_high = [], [], [], []
