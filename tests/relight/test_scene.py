@@ -118,7 +118,7 @@ def test_float_pixels_above_white_are_valid_and_not_finite_ones_are_not(tmp_path
 def test_frames_are_undistorted_to_the_pinhole(tmp_path, k1):
     distorted = straight_camera(distortion=[k1, 0.02, 0.003, -0.002])
     v, u = np.mgrid[0:30, 0:40] + 0.5
-    # The scene is a gradient in pinhole pixels; what the lens puts into a pixel follows by inverting its model.
+    # The scene is a gradient in pinhole pixels; what the lens makes of it follows by inverting its model.
     x_d, y_d = (u - 20) / 30, (v - 15) / 30
     x, y = x_d.copy(), y_d.copy()
     for _ in range(200):
