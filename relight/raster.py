@@ -28,6 +28,7 @@ NEAR_M = 1e-3
 """Points nearer than this to the camera plane are not drawn: their projection has no meaning."""
 
 _ID_BITS = 32
+_CHUNK = 1 << 16  # points at a time on the CPU: what is computed of them stays in its cache
 _EMPTY = 0x7F800000 << _ID_BITS
 """Key of depth +inf, behind every point. `pad` takes its value as a float64, in which the largest int64 is
 none but this number is exact."""
@@ -59,12 +60,13 @@ def project(points_world: torch.Tensor, camera: Camera) -> tuple[torch.Tensor, t
         meaning: test z.
     """
     cam_from_world = torch.as_tensor(camera.cam_from_world, dtype=torch.float64)
-    # One matrix for rotation and intrinsics, multiplied in float64, spares a pass over the points.
+    # One matrix for rotation and intrinsics, multiplied in float64, spares a pass over the points; as rows, u, v
+    # and z are each contiguous, which what follows reads at several times the speed.
     image_from_world = torch.as_tensor(np.asarray(camera.K), dtype=torch.float64) @ cam_from_world[:3]
     image_from_world = image_from_world.to(points_world)
-    homogeneous = torch.addmm(image_from_world[:, 3], points_world, image_from_world[:, :3].T)
-    z_m = homogeneous[:, 2]
-    return homogeneous[:, :2] / z_m[:, None], z_m
+    rows = torch.addmm(image_from_world[:, 3:], image_from_world[:, :3], points_world.T)
+    z_m = rows[2]
+    return (rows[:2] / z_m).T, z_m
 
 
 def rasterize_ids(points_world: torch.Tensor, camera: Camera, levels: int = 1) -> IdPyramid:
@@ -90,16 +92,20 @@ def rasterize_ids(points_world: torch.Tensor, camera: Camera, levels: int = 1) -
         )
     height, width = camera.height, camera.width
     device = points_world.device
-    uv_px, z_m = project(points_world, camera)
-    u, v = uv_px.unbind(1)
-    # Comparisons with NaN are false, so non-finite points drop out here too.
-    inside = (z_m > NEAR_M) & (u >= 0) & (u < width) & (v >= 0) & (v < height) & (z_m < torch.inf)
-    ids = inside.nonzero()[:, 0]
-    pixel = v[ids].to(torch.int64) * width + u[ids].to(torch.int64)
-    key = (z_m[ids].float().contiguous().view(torch.int32).to(torch.int64) << _ID_BITS) | ids
-    buffer = torch.full((height * width,), _EMPTY, dtype=torch.int64, device=device)
-    buffer.scatter_reduce_(0, pixel, key, "amin")
-    keys = [buffer.view(height, width)]
+    buffer = torch.full((height * width + 1,), _EMPTY, dtype=torch.int64, device=device)
+    chunk = _CHUNK if device.type == "cpu" else max(1, len(points_world))
+    for first in range(0, len(points_world), chunk):
+        uv_px, z_m = project(points_world[first : first + chunk], camera)
+        u, v = uv_px.unbind(1)
+        # Comparisons with NaN are false, so non-finite points drop out here too.
+        inside = (z_m > NEAR_M) & (u >= 0) & (u < width) & (v >= 0) & (v < height) & (z_m < torch.inf)
+        u, v = u.where(inside, 0.0).to(torch.int64), v.where(inside, 0.0).to(torch.int64)
+        # What is outside goes to a pixel behind the last: writing it costs less than picking out the others.
+        pixel = (v * width + u).masked_fill_(~inside, height * width)
+        key = z_m.float().view(torch.int32).to(torch.int64).bitwise_left_shift_(_ID_BITS)
+        key |= torch.arange(first, first + len(key), device=device)
+        buffer.scatter_reduce_(0, pixel, key, "amin")
+    keys = [buffer[:-1].view(height, width)]
     for _ in range(levels - 1):
         keys.append(_min_2x2(keys[-1]))
     return IdPyramid(tuple(_ids(k) for k in keys), tuple(_depths(k) for k in keys))
