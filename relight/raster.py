@@ -60,8 +60,8 @@ def project(points_world: torch.Tensor, camera: Camera) -> tuple[torch.Tensor, t
         meaning: test z.
     """
     cam_from_world = torch.as_tensor(camera.cam_from_world, dtype=torch.float64)
-    # One matrix for rotation and intrinsics, multiplied in float64, spares a pass over the points; as rows, u, v
-    # and z are each contiguous, which what follows reads at several times the speed.
+    # One matrix for rotation and intrinsics, multiplied in float64, spares a pass over the points. As rows,
+    # u, v and z are each contiguous, which what follows reads at several times the speed.
     image_from_world = torch.as_tensor(np.asarray(camera.K), dtype=torch.float64) @ cam_from_world[:3]
     image_from_world = image_from_world.to(points_world)
     rows = torch.addmm(image_from_world[:, 3:], image_from_world[:, :3], points_world.T)
