@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import shutil
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,6 +20,7 @@ EXAMPLE = "relight demo --out demo --seed 3"
 
 _MARKER = ".relight-demo"
 _MARKER_TEXT = "Made by `relight demo`, which replaces this folder when it runs again.\n"
+_FILM_S = 12.0  # a dozen flashes; a real capture takes twenty seconds
 _ORBIT_S, _ORBIT_SCALE = 3.0, 0.75
 
 
@@ -52,6 +54,8 @@ def run(args: argparse.Namespace) -> None:
     prepare_folder(out)
     filmed, session = out / "capture", out / "session"
     config = RigConfig.small() if args.quick else RigConfig.from_seed(args.seed)
+    if not args.quick:
+        config = replace(config, path=replace(config.path, duration_s=_FILM_S))
     with StageProgress() as progress:
         video = simulate_video(filmed, config, progress)
         options = ImportOptions(poses=filmed / "cameras.json", points=filmed / "points.ply")
