@@ -118,8 +118,11 @@ def prepare_cloud(
     wanted = config.footprint * _nearest_footprint(points, cameras)
     area = len(points) * _mean_spacing(points) ** 2
     wanted = max(wanted, math.sqrt(area / config.max_points))
-    points, normals = resample(points, normals, wanted)
-    return SurfaceCloud(points, normals, wanted, noise)
+    sampled = resample(points, normals, wanted)
+    if len(sampled[0]) > 1.1 * config.max_points:  # the area was an estimate
+        wanted *= math.sqrt(len(sampled[0]) / config.max_points)
+        sampled = resample(points, normals, wanted)
+    return SurfaceCloud(*sampled, wanted, noise)
 
 
 def clean(points: Floats, outlier_factor: float) -> NDArray[np.int64]:

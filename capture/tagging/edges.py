@@ -159,8 +159,8 @@ def _curve(
 ) -> tuple[EdgeCurve, Floats]:
     """Likelihood on a grid that is refined around its peak, and the least cost.
 
-    A peak can be a hundred times narrower than the grid and show at none of its points; the soft cost is wide enough to
-    lead there.
+    A peak can be a hundred times narrower than the grid and show at none of its points; the soft cost is
+    wide enough to lead there.
     """
     count = max(int(np.ceil(float(np.max(high - low)) / step_s)) + 1, 3)
     time = np.linspace(low, high, count, axis=1)
@@ -190,8 +190,8 @@ class _Model:
     def costs(self, on_s: Floats, off_s: Floats) -> tuple[Floats, Floats]:
         """[P, G] -2 log likelihood at edges [P, G or 1], and a soft version of it.
 
-        A Student-t error per frame and band, and g's prior; in the soft version errors are taken for so much smaller that
-        they are all in the error's quadratic middle.
+        A Student-t error per frame and band, and g's prior; in the soft version errors are taken for so much
+        smaller that they are all in the error's quadratic middle.
         """
         lit = self._lit(on_s, off_s)
         gain = self._full_gain(lit)
