@@ -38,7 +38,7 @@ class TaggingConfig:
     min_separation: float = 5.0
     full_lit: float = 0.98
     none_lit: float = 0.02
-    risk: float = 0.02
+    risk: float = 0.01
     clip_display: float = 0.98
     clipped_share: float = 0.02
     hopeless_share: float = 0.5

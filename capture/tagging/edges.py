@@ -23,15 +23,13 @@ Floats = NDArray[np.float64]
 # A band's gain may differ by this share between pulses as the camera moves around the head, and it does so
 # together with its neighbours: so many bands count as one in the prior.
 _GAIN_FREEDOM, _GAIN_RUN = 0.3, 6
-# Around a peak the grid is so many times finer, and as much again: from a step of 1 ms to 0.01 ms.
-_FINER = 10
-# The first look at both edges together: so many grid steps apart for the one, so many ends for the other,
-# and so many bands made one, for it need not be sharp.
-_COARSE_FACTOR, _COARSE_ENDS, _MERGE = 3, 24, 4
-# Turns of the pattern search: on the soft cost from 4 ms to 1 ms, on the sharp one from 1 ms to 0.003 ms.
-_SOFT_TURNS, _SHARP_TURNS = 4, 10
-# Offsets of the pattern, the centre first, so that a plateau does not make it walk.
-_AROUND = np.array([(0, 0), *((i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j)], float).T
+# Levels of refinement around a peak, each this many times finer: from a step of 1 ms to 0.01 ms, finer than
+# any peak.
+_REFINEMENTS, _FINER = 2, 10
+# The first look at both edges together: this many grid steps apart for the one, this many ends for the other.
+_COARSE_FACTOR, _COARSE_ENDS = 2, 8
+# Factor of the soft cost: plain squares, so small that the plateau of edges no row looks at stays flat.
+_SOFTENING = 0.05
 # Log likelihoods within this of the maximum do not tell times apart.
 _FLAT = 0.1
 # A band whose gain is below this takes no part in the prior's share, which would pin it to zero.
@@ -41,8 +39,8 @@ _RUN = 12
 # Residuals smaller than expected make the weights larger only this far: a camera on a tripod leaves errors
 # of the model.
 _LEAST_SCALE2 = 0.5
-#: Student-t degrees of freedom of a band's error: motion has heavy tails.
-TAIL = 3.0
+# Student-t degrees of freedom of a band's error: motion has heavy tails.
+_TAIL = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,54 +135,45 @@ def find_edges(
         step_s: grid step away from the peaks.
     """
     model = _Model(data, readout_s, exposure_s, gain_prior)
-    coarse_prior = gain_prior.reshape(-1, _MERGE).mean(axis=1)
-    coarse = _Model(data.merged(_MERGE), readout_s, exposure_s, coarse_prior)
-    # The edges meet in g: find both together, then ask for each with the other held.
-    on_s, off_s = _best_pair(model, coarse, edges, step_s)
-    off, off_cost = _curve(
-        lambda t: model.cost(on_s[:, None], t), edges.off_low, edges.off_high, step_s, off_s
-    )
-    on, on_cost = _curve(lambda t: model.cost(t, off_s[:, None]), edges.on_low, edges.on_high, step_s, on_s)
-    best = -0.5 * np.minimum(on_cost, off_cost)
-    return Edges(on=on, off=off, best=best, gain=model.gain(on.best_s, off.best_s))
+    # The edges meet in g: look at both together first, coarsely, then at each with the other held.
+    on_s, off_s = _coarse_pair(model, edges, step_s)
+    off, off_cost = _curve(lambda t: model.costs(on_s[:, None], t), edges.off_low, edges.off_high, step_s)
+    off_s = off.best_s
+    on, on_cost = _curve(lambda t: model.costs(t, off_s[:, None]), edges.on_low, edges.on_high, step_s)
+    on_s = on.best_s
+    return Edges(on=on, off=off, best=-0.5 * np.minimum(on_cost, off_cost), gain=model.gain(on_s, off_s))
 
 
-def _best_pair(model: _Model, coarse: _Model, edges: EdgeRange, step_s: float) -> tuple[Floats, Floats]:
-    """[P] t_on and [P] t_off of the least cost.
-
-    The valley of the cost can be a hundred times narrower than any grid: a soft cost leads near it, and a
-    pattern search (Hooke and Jeeves 1961), with diagonals, into it.
-    """
+def _coarse_pair(model: _Model, edges: EdgeRange, step_s: float) -> tuple[Floats, Floats]:
+    """[P] t_on and [P] t_off of the least cost on a coarse grid of both."""
     count = int(np.ceil(float(np.max(edges.on_high - edges.on_low)) / (_COARSE_FACTOR * step_s))) + 1
     on_s = np.linspace(edges.on_low, edges.on_high, count, axis=1)
     off_s = np.linspace(edges.off_low, edges.off_high, _COARSE_ENDS, axis=1)
-    on_reach, off_reach = on_s[:, 1:2] - on_s[:, :1], off_s[:, 1:2] - off_s[:, :1]
-    tried = np.repeat(on_s, _COARSE_ENDS, axis=1), np.tile(off_s, (1, count))
-    for turn in range(_SOFT_TURNS + _SHARP_TURNS):
-        cost = coarse.squares(*tried) if turn < _SOFT_TURNS else model.cost(*tried)
-        at = np.argmin(cost, axis=1)[:, None]
-        on_s, off_s = (np.take_along_axis(times, at, axis=1) for times in tried)
-        if turn == _SOFT_TURNS - 1:
-            on_reach = off_reach = np.full_like(on_s, step_s)
-        shrink = np.where(at == 0, 0.5, 1.0) if turn else 0.5
-        on_reach, off_reach = shrink * on_reach, shrink * off_reach
-        tried = (
-            np.clip(on_s + on_reach * _AROUND[0], edges.on_low[:, None], edges.on_high[:, None]),
-            np.clip(off_s + off_reach * _AROUND[1], edges.off_low[:, None], edges.off_high[:, None]),
-        )
-    return on_s[:, 0], off_s[:, 0]
+    pairs_on, pairs_off = np.repeat(on_s, _COARSE_ENDS, axis=1), np.tile(off_s, (1, count))
+    at = np.argmin(model.costs(pairs_on, pairs_off)[1], axis=1)[:, None]
+    return np.take_along_axis(pairs_on, at, axis=1)[:, 0], np.take_along_axis(pairs_off, at, axis=1)[:, 0]
 
 
 def _curve(
-    cost: Callable[[Floats], Floats], low: Floats, high: Floats, step_s: float, peak_s: Floats
+    costs: Callable[[Floats], tuple[Floats, Floats]], low: Floats, high: Floats, step_s: float
 ) -> tuple[EdgeCurve, Floats]:
-    """Likelihood on a grid that is fine around its peak, and the least cost."""
+    """Likelihood on a grid that is refined around its peak, and the least cost.
+
+    A peak can be a hundred times narrower than the grid and show at none of its points; the soft cost is
+    wide enough to lead there.
+    """
     count = max(int(np.ceil(float(np.max(high - low)) / step_s)) + 1, 3)
-    near = np.linspace(-step_s, step_s, 2 * _FINER + 1)
-    fine = peak_s[:, None] + np.concatenate([near, near / _FINER])
-    time = np.concatenate([np.linspace(low, high, count, axis=1), fine], axis=1)
-    time = np.sort(np.clip(time, low[:, None], high[:, None]), axis=1)
-    value = cost(time)
+    time = np.linspace(low, high, count, axis=1)
+    value, guide = costs(time)
+    for level in range(_REFINEMENTS):
+        reach = step_s / _FINER**level
+        centre = EdgeCurve(time, -0.5 * (guide - guide.min(axis=1, keepdims=True))).best_s
+        extra = centre[:, None] + np.linspace(-reach, reach, 2 * _FINER + 1)
+        extra = np.clip(extra, low[:, None], high[:, None])
+        time, value = np.concatenate([time, extra], axis=1), np.concatenate([value, costs(extra)[0]], axis=1)
+        order = np.argsort(time, axis=1)
+        time, value = np.take_along_axis(time, order, axis=1), np.take_along_axis(value, order, axis=1)
+        guide = value
     least = value.min(axis=1)
     return EdgeCurve(time, -0.5 * (value - least[:, None])), least
 
@@ -198,27 +187,23 @@ class _Model:
         self._prior_weight = 1.0 / _GAIN_RUN / (_GAIN_FREEDOM * np.maximum(gain_prior, _LEAST_GAIN)) ** 2
         self._weighted = data.weight * data.gain
 
-    def cost(self, on_s: Floats, off_s: Floats) -> Floats:
-        """[P, G] -2 log likelihood at edges [P, G or 1]: Student-t errors of all bands, and g's prior."""
-        error2, gain = self._squared_errors(on_s, off_s)
-        error2 /= TAIL
-        error2 += 1.0
-        # one logarithm of the product over frames; few frames, so it cannot overflow
-        cost = (TAIL + 1) * np.log(error2.prod(axis=2)).sum(axis=2)
-        return cost + (np.square(gain - self._prior) * self._prior_weight).sum(axis=2)
+    def costs(self, on_s: Floats, off_s: Floats) -> tuple[Floats, Floats]:
+        """[P, G] -2 log likelihood at edges [P, G or 1], and a soft version of it.
 
-    def squares(self, on_s: Floats, off_s: Floats) -> Floats:
-        """[P, G] plain sum of squared errors: a soft cost, whose valley is wide."""
-        return self._squared_errors(on_s, off_s)[0].sum(axis=(2, 3))
-
-    def _squared_errors(self, on_s: Floats, off_s: Floats) -> tuple[Floats, Floats]:
-        """[P, G, n, B] squared errors in units of their variance, and [P, G, B] gains."""
+        A Student-t error per frame and band, and g's prior; in the soft version errors are taken for so much
+        smaller that they are all in the error's quadratic middle.
+        """
         lit = self._lit(on_s, off_s)
         gain = self._full_gain(lit)
         error2 = self._data.gain[:, None] - lit * gain[:, :, None]
         error2 *= error2
-        error2 *= self._data.weight[:, None]
-        return error2, gain
+        error2 *= self._data.weight[:, None] / _TAIL
+        prior = (np.square(gain - self._prior) * self._prior_weight).sum(axis=2)
+        soft = error2.sum(axis=(2, 3)) * _SOFTENING
+        error2 += 1.0
+        # one logarithm of the product over frames; few frames, so it cannot overflow
+        cost = (_TAIL + 1) * np.log(error2.prod(axis=2)).sum(axis=2)
+        return cost + prior, soft
 
     def gain(self, on_s: Floats, off_s: Floats) -> Floats:
         """[P, B] gain of fully lit bands at edges [P]."""
@@ -261,7 +246,7 @@ def _variance_factor(error: Floats) -> float:
     square = np.square(error)
     scale2 = 1.0
     for _ in range(20):
-        scale2 = max(float(np.mean((TAIL + 1) * square / (TAIL + square / scale2))), 1e-12)
+        scale2 = max(float(np.mean((_TAIL + 1) * square / (_TAIL + square / scale2))), 1e-12)
     scale2 = max(scale2, _LEAST_SCALE2)
     limited = np.clip(error / np.sqrt(scale2), -3, 3)
     runs = limited.reshape(len(error), -1, _RUN).mean(axis=-1)
