@@ -3,6 +3,7 @@
 RelightError
 ├── LightError       a light, its description or its panorama cannot be used
 ├── PlanError        a session cannot be fitted as it is, or a decision cannot be forced
+│   └── GeometryError poses, cloud or masks cannot be found in the frames
 ├── PortraitError    a portrait is missing or cannot be read
 └── TruthError       a folder with ground truth cannot be used
 
@@ -19,6 +20,10 @@ class LightError(RelightError):
 
 class PlanError(RelightError):
     """A session cannot be fitted as it is, or a decision of its plan cannot be forced."""
+
+
+class GeometryError(PlanError):
+    """Poses, cloud or masks cannot be found in the frames of a session."""
 
 
 class PortraitError(RelightError):
