@@ -302,6 +302,16 @@ class Session:
         return self.scene_dir / "points.ply"
 
     @property
+    def sparse_path(self) -> Path:
+        """The points that the poses were found with, where they were found and not given."""
+        return self.scene_dir / "sparse.ply"
+
+    @property
+    def dense_path(self) -> Path:
+        """The cloud as stereo leaves it, before it is cleaned into `points_path`."""
+        return self.scene_dir / "dense.ply"
+
+    @property
     def masks_dir(self) -> Path:
         """Masks by frame index."""
         return self.scene_dir / "masks"

@@ -13,14 +13,19 @@ from relight.lighting import Light
 from relight.measure import Render, Rendering, measure
 from relight.portrait import Portrait, load_portrait
 from relight.render import PortraitRenderer
+from relight.stage_cache import StageCache
 from relight.stages import Progress, no_progress
 from relight.truth import load_truth
+from relight.truth_cameras import align_to_truth
 
 
 def evaluate(
     session: Path, truth: Path, portrait: str = "solve", *, progress: Progress = no_progress
 ) -> dict[str, Any]:
     """Renders a session's portrait at the views of a truth and measures it.
+
+    A session whose poses were found from its frames has a world of its own; it is brought into the truth's by
+    the cameras of its frames first.
 
     Args:
         session: the session's folder.
@@ -29,7 +34,8 @@ def evaluate(
         progress: told (stage, fraction done).
 
     Returns:
-        As `measure`, with "session", "portrait" and, where the fit left them, its times as "fit".
+        As `measure`, with "session", "portrait", "alignment" where the worlds differ and, where the fit left
+        them, its times as "fit".
 
     Raises:
         RelightError: the session, the portrait or the truth cannot be read.
@@ -37,7 +43,11 @@ def evaluate(
     opened = Session.open(session)
     folder = opened.portraits_dir / portrait
     result: dict[str, Any] = {"session": opened.path.resolve().name, "portrait": portrait}
-    result |= measure(load_truth(truth), portrait_renderer(load_portrait(folder)), progress)
+    fitted = load_portrait(folder)
+    if StageCache(opened).record("poses") is not None:
+        similarity, result["alignment"] = align_to_truth(opened, truth)
+        fitted = fitted.transformed(similarity)
+    result |= measure(load_truth(truth), portrait_renderer(fitted), progress)
     if (folder / "metrics.json").is_file():
         fit = read_json(folder / "metrics.json", PortraitError).values
         result["fit"] = {

@@ -122,7 +122,7 @@ def _metrics(plan: Plan, portrait: Portrait, stages: Stages, device: torch.devic
         "estimated_s": round(plan.estimated_s, 1),
         "seconds": {stage: round(seconds, 3) for stage, seconds in stages.seconds.items()},
         "total_s": round(stages.total_s, 3),
-        **memory_summary(device),
+        **memory_summary(stages, device),
         "solve": dict(portrait.info),
         "versions": {
             "relightable-portrait-rig": installed_version(),

@@ -19,6 +19,7 @@ def measure_rows(result: Mapping[str, Any]) -> list[Row]:
         *_normals(result),
         *_lights(result),
         *_mask(result),
+        *_poses(result),
         *_time(result),
     ]
 
@@ -93,6 +94,19 @@ def _mask(result: Mapping[str, Any]) -> Iterator[Row]:
             _number(measures["silhouette_f"], ".3f"),
             f"within {TOLERANCE_PX:g} px",
         )
+
+
+def _poses(result: Mapping[str, Any]) -> Iterator[Row]:
+    if errors := result.get("alignment"):
+        share = errors["centre_median_share"]
+        note = f"median of {errors['cameras']:.0f} cameras, worst {errors['rotation_worst_deg']:.3f}°"
+        yield "poses, rotation error", _number(errors["rotation_median_deg"], ".3f", "°"), note
+        yield (
+            "poses, error of the centre",
+            _number(1000.0 * errors["centre_median"], ".2f", " mm"),
+            f"{share:.2%} of the distance, worst {1000.0 * errors['centre_worst']:.2f} mm",
+        )
+        yield "unit of length, true metres", _number(errors["scale"], ".3f"), "1 = right"
 
 
 def _time(result: Mapping[str, Any]) -> Iterator[Row]:

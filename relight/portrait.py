@@ -22,6 +22,7 @@ from safetensors.torch import load_file, save
 
 from capture.atomic import atomic_write
 from capture.json_fields import parse_json
+from relight.alignment import Similarity
 from relight.errors import PortraitError
 from relight.reflectance import Reflectance
 
@@ -93,6 +94,20 @@ class Portrait:
     def subset(self, keep: torch.Tensor) -> Portrait:
         """Some of the points: [P] bool, or their indices."""
         return replace(self, **{name: getattr(self, name)[keep] for name in _TENSORS})
+
+    def transformed(self, similarity: Similarity) -> Portrait:
+        """The portrait in another world; it looks the same to cameras that are taken along."""
+        turn = torch.as_tensor(similarity.rotation).to(self.points)
+        scale = similarity.scale
+        moved = scale * (self.points @ turn.T) + torch.as_tensor(similarity.translation).to(self.points)
+        return replace(
+            self,
+            points=moved,
+            normals_world=self.normals_world @ turn.T,
+            spacing=scale * self.spacing,
+            c_flash=_vector([scale**2 * value for value in self.c_flash]),  # it is divided by d^2
+            flash_offset_cam_m=_vector([scale * value for value in self.flash_offset_cam_m]),
+        )
 
     def save(self, folder: Path) -> None:
         """Writes the two files; each is there whole or not at all."""

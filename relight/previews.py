@@ -34,6 +34,8 @@ from relight.upright import upright_camera, upright_picture
 _LONGEST_SIDE_PX = 420
 _PAIRS = 4
 _ORBIT_VIEWS = 7
+_MASKS = 4
+_OFF = 0.2  # of its light is left to what is off the subject
 
 _MARGIN = 0.06  # about the head, in its own size
 _RING, _RING_RAD = 6, 0.16  # a soft lamp: lights on its rim, and half its angle
@@ -48,7 +50,7 @@ class Preview:
 
     Attributes:
         file: Name beside previews.json.
-        group: Section: relit, captured, maps or orbit.
+        group: Section: relit, captured, maps, orbit or masks.
         caption: For a person.
     """
 
@@ -146,7 +148,9 @@ class _Gallery:
         }
         self._front = framed(self._cameras[self._shown[len(self._shown) // 2].index], portrait.points)
         self._pairs = self._chosen_pairs()
-        self.count = len(studio_lights(self._front)) + len(self._pairs) + 4 + 1
+        masked = [record for record in self._shown if session.mask_path(record.index).is_file()]
+        self._masked = _evenly(masked, _MASKS)
+        self.count = len(studio_lights(self._front)) + len(self._pairs) + 4 + 1 + len(self._masked)
 
     def pictures(self) -> Iterator[tuple[Preview, Picture]]:
         """All of them, in the order of the report."""
@@ -155,6 +159,8 @@ class _Gallery:
             yield self._pair(record)
         yield from self._maps()
         yield self._orbit()
+        for record in self._masked:
+            yield self._mask(record)
 
     def _relit(self) -> Iterator[tuple[Preview, Picture]]:
         lights = studio_lights(self._front)
@@ -199,6 +205,19 @@ class _Gallery:
             ("mask", "mask: what is head", display_picture(white, maps.mask)),
         ):
             yield Preview(f"{name}.jpg", "maps", caption), picture
+
+    def _mask(self, record: FrameRecord) -> tuple[Preview, Picture]:
+        """A frame with what is off the subject darkened."""
+        camera = _small(self._cameras[record.index])
+        coverage = self._session.load_mask(record)
+        assert coverage is not None
+        mask = upright_picture(coverage, self._rotation_deg)
+        frame = upright_picture(self._session.load_radiance(record), self._rotation_deg)
+        size = (camera.width, camera.height)
+        mask = cv2.resize(mask, size, interpolation=cv2.INTER_AREA).astype(np.float32) / 255.0
+        shown = to_display(np.clip(cv2.resize(frame, size, interpolation=cv2.INTER_AREA), 0.0, 1.0))
+        picture = _bytes(shown * (_OFF + (1.0 - _OFF) * mask[..., None]))
+        return Preview(f"mask_{record.index:06d}.jpg", "masks", f"frame {record.index}"), picture
 
     def _orbit(self) -> tuple[Preview, Picture]:
         """One strip of views along the captured arc, under a light that stays where it is in the world."""

@@ -31,9 +31,10 @@ _GROUPS = (
     ),
     ("maps", "What the light was taken apart into", "", "grid"),
     ("orbit", "Around the head", "", "grid wide"),
+    ("masks", "What was taken for the subject", "", "grid"),
 )
 
-_ACTION_WORDS = {"run": "runs", "skip": "skipped", "given": "given", "refuse": "missing"}
+_ACTION_WORDS = {"run": "runs", "skip": "skipped", "given": "given", "kept": "kept", "refuse": "missing"}
 
 
 def write_report(session_path: Path, portrait: str) -> Path:
@@ -54,6 +55,7 @@ def write_report(session_path: Path, portrait: str) -> Path:
         *_pictures(folder / "previews"),
         _measures(_optional_json(folder / "evaluation.json")),
         _plan(plan),
+        _geometry(metrics.get("geometry", {})),
         _frames(session, frozenset(plan.get("frames", []))),
         _times(metrics),
     ]
@@ -132,6 +134,20 @@ def _plan(plan: Mapping[str, Any]) -> str:
         for decision in plan["decisions"]
     )
     return _section("Plan", _table(("step", "", "why", "saves"), rows))
+
+
+def _geometry(stages: Mapping[str, Any]) -> str:
+    """What was found from the frames: a row for each number that a stage reports."""
+    rows = []
+    for stage, report in stages.items():
+        facts = [(name, value) for name, value in report.items() if isinstance(value, (int, float, str))]
+        for place, (name, value) in enumerate(facts):
+            said = f"{value:.4g}" if isinstance(value, float) else str(value)
+            rows.append(
+                f"<tr><td>{escape(stage) if place == 0 else ''}</td><td>{escape(name.replace('_', ' '))}</td>"
+                f"<td>{escape(said)}</td></tr>"
+            )
+    return _section("Found in the frames", _table(("", "", ""), rows)) if rows else ""
 
 
 def _frames(session: Session, fitted: frozenset[int]) -> str:

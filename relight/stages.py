@@ -6,6 +6,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -19,20 +20,27 @@ def no_progress(stage: str, fraction: float) -> None:
 
 
 class Stages:
-    """Wall-clock seconds by stage, in the order in which they ran."""
+    """Wall-clock seconds and most memory by stage, in the order in which they ran.
+
+    Attributes:
+        seconds: By stage.
+        memory_mb: By stage, the most that the process held in it (`peak_memory_mb`), where that is known.
+    """
 
     def __init__(self, clock: Callable[[], float] = time.perf_counter) -> None:
         self.seconds: dict[str, float] = {}
+        self.memory_mb: dict[str, float] = {}
         self._clock = clock
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
         """Times what is done inside; a stage that runs twice adds up."""
         started_s = self._clock()
+        forget_peak_memory()
         try:
             yield
         finally:
-            self.seconds[name] = self.seconds.get(name, 0.0) + self._clock() - started_s
+            self._ended(name, self._clock() - started_s)
 
     @contextmanager
     def follow(self, progress: Progress) -> Iterator[Progress]:
@@ -44,7 +52,8 @@ class Stages:
             nonlocal since_s
             now_s = self._clock()
             if current:  # what precedes the first name belongs to it
-                self.seconds[current] = self.seconds.get(current, 0.0) + now_s - since_s
+                self._ended(current, now_s - since_s)
+                forget_peak_memory()
                 since_s = now_s
 
         def told(stage: str, fraction: float) -> None:
@@ -54,10 +63,16 @@ class Stages:
                 current = stage
             progress(stage, fraction)
 
+        forget_peak_memory()
         try:
             yield told
         finally:
             end_stage()
+
+    def _ended(self, name: str, seconds: float) -> None:
+        self.seconds[name] = self.seconds.get(name, 0.0) + seconds
+        if (peak := peak_memory_mb()) is not None:
+            self.memory_mb[name] = max(peak, self.memory_mb.get(name, 0.0))
 
     @property
     def total_s(self) -> float:
@@ -65,8 +80,22 @@ class Stages:
         return sum(self.seconds.values())
 
 
+def forget_peak_memory() -> None:
+    """Begins `peak_memory_mb` anew where the system can (Linux); elsewhere that of the whole run stays."""
+    try:
+        Path("/proc/self/clear_refs").write_text("5")
+    except OSError:
+        return
+
+
 def peak_memory_mb() -> float | None:
-    """Most resident memory of this process so far, 10^6 bytes; None where the system does not say."""
+    """Most resident memory of this process since it began or `forget_peak_memory`, 10^6 bytes; None where the
+    system does not say."""
+    try:
+        status = Path("/proc/self/status").read_text()
+        return int(status.split("VmHWM:")[1].split()[0]) * 1024 / 1e6
+    except (OSError, IndexError, ValueError):
+        pass
     try:
         import resource
     except ImportError:  # Windows
@@ -75,9 +104,12 @@ def peak_memory_mb() -> float | None:
     return peak / 1e6 if sys.platform == "darwin" else peak * 1024 / 1e6
 
 
-def memory_summary(device: torch.device) -> dict[str, Any]:
-    """Peak memory for metrics.json, of the card too where one was used."""
-    summary: dict[str, Any] = {"peak_memory_mb": peak_memory_mb()}
+def memory_summary(stages: Stages, device: torch.device) -> dict[str, Any]:
+    """Peak memory for metrics.json: of all stages, of each, and of the card where one was used."""
+    summary: dict[str, Any] = {
+        "peak_memory_mb": max(stages.memory_mb.values(), default=None),
+        "stage_memory_mb": {stage: round(peak) for stage, peak in stages.memory_mb.items()},
+    }
     if device.type == "cuda":
         summary["peak_cuda_memory_mb"] = torch.cuda.max_memory_allocated(device) / 1e6
     return summary

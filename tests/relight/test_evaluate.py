@@ -1,19 +1,24 @@
 """A portrait whose every number is known, a sphere, through `evaluate`."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
-from capture.cameras import Camera, PosedFrame, PosedSet, save_posed_set
+from capture.cameras import Camera, PosedFrame, PosedSet, load_posed_set, save_posed_set
+from capture.frame_record import FrameRecord
 from capture.images import write_exr, write_png
 from capture.session import Session
-from relight.errors import PortraitError, TruthError
+from relight.alignment import Similarity
+from relight.errors import GeometryError, PortraitError, TruthError
 from relight.evaluate import evaluate
 from relight.measure_table import format_table
 from relight.portrait import Portrait
 from relight.reflectance import Reflectance
+from relight.stage_cache import StageCache
 
 RADIUS_M, DISTANCE_M, SIZE = 0.1, 0.5, 96
 ALBEDO = np.array([0.6, 0.4, 0.3])
@@ -108,6 +113,56 @@ def test_a_known_sphere_scores_as_its_maps_are_exact(session):
     assert result["lights"]["side"]["psnr_db"] > 35
     # The outline is right to half a pixel of a disk 36 pixels in radius.
     assert result["mask"]["iou"] > 0.95
+
+
+def test_a_portrait_in_a_world_of_its_own_scores_as_in_the_truths(session, tmp_path):
+    truth = tmp_path / "truth"
+    write_truth(truth)
+    train = []  # around the sphere; without pictures, for only their poses matter here
+    for k, angle in enumerate(np.linspace(-0.6, 0.6, 5)):
+        cam_from_world = sphere_camera("0000").cam_from_world.copy()
+        cam_from_world[:3, :3] = Rotation.from_rotvec([0.2 * angle, angle, 0]).as_matrix()
+        camera = replace(sphere_camera(f"{k + 1:04d}"), cam_from_world=cam_from_world)
+        train.append(PosedFrame(camera, k + 1, file=truth / f"{k + 1:04d}.png", flash=0, split="train"))
+    validation = load_posed_set(truth / "cameras.json")
+    save_posed_set(replace(validation, frames=(*validation.frames, *train)), truth / "cameras.json")
+
+    elsewhere = Similarity(
+        2.5, Rotation.from_euler("xyz", [1.0, 2.0, 3.0]).as_matrix(), np.array([1.0, -2, 3])
+    )
+    with Session.create(tmp_path / "S", source={"kind": "test"}, width=SIZE, height=SIZE) as found:
+        for frame in train:
+            file = found.write_frame(frame.index, np.zeros((SIZE, SIZE, 3), np.uint8))
+            found.append_frame(
+                FrameRecord(
+                    index=frame.index, file=file, width=SIZE, height=SIZE, flash=0, source=frame.file.name
+                )
+            )
+        found.save_scene_cameras({frame.index: elsewhere.camera(frame.camera) for frame in train})
+    StageCache(found).store("poses", "key", settings={}, report={})
+    sphere_portrait().transformed(elsewhere).save(found.portraits_dir / "solve")
+
+    result = evaluate(found.path, truth)
+    assert result["alignment"]["scale"] == pytest.approx(1 / 2.5)
+    assert result["alignment"]["rotation_worst_deg"] < 1e-5
+    known = evaluate(session, session.parent / "truth")
+    # The same but for the rounding of float32 positions, which moves an outline's pixel now and then.
+    assert result["captured"]["psnr_db"] == pytest.approx(known["captured"]["psnr_db"], abs=0.5)
+    assert result["normals"]["median_deg"] == pytest.approx(known["normals"]["median_deg"], abs=0.02)
+    assert result["lights"]["side"]["psnr_db"] == pytest.approx(known["lights"]["side"]["psnr_db"], abs=0.5)
+    assert result["mask"]["iou"] == pytest.approx(known["mask"]["iou"], abs=0.005)
+    assert "rotation error" in format_table(result)
+
+
+def test_a_found_world_needs_the_true_cameras(session, tmp_path):
+    with Session.create(tmp_path / "S", source={"kind": "test"}, width=SIZE, height=SIZE) as found:
+        file = found.write_frame(0, np.zeros((SIZE, SIZE, 3), np.uint8))
+        found.append_frame(FrameRecord(index=0, file=file, width=SIZE, height=SIZE, flash=0, source="9.png"))
+        found.save_scene_cameras({0: sphere_camera("a")})
+    StageCache(found).store("poses", "key", settings={}, report={})
+    sphere_portrait().save(found.portraits_dir / "solve")
+    with pytest.raises(GeometryError, match="0 cameras are known in both worlds"):
+        evaluate(found.path, session.parent / "truth")
 
 
 def test_what_the_fit_took_stands_beside_its_errors(session):
