@@ -10,9 +10,9 @@ from pathlib import Path
 
 from capture.colmap_model import is_colmap_model, read_colmap_model
 from capture.errors import SourceError
-from capture.importers.flash_list import read_flash_list
-from capture.importers.image_set import SourceFrame, named_masks, natural_order, write_image_set
+from capture.importers.image_set import natural_order, write_image_set
 from capture.importers.options import ImportOptions, Progress
+from capture.importers.source_frame import SourceFrame
 from capture.ply import PointCloud
 from capture.session import Session
 
@@ -45,22 +45,20 @@ def import_colmap(model: Path, out: Path, options: ImportOptions, progress: Prog
             f"There is no folder 'images' beside {model}; put the pictures there, or a link to them."
         )
     names = sorted(reconstruction.cameras, key=natural_order)
-    flags: list[int | None] = [None] * len(names)
-    if options.flash_list is not None:
-        flags = read_flash_list(options.flash_list, names)
-    masks = named_masks(options.masks, names)
-    if not masks and (images.parent / "masks").is_dir():
-        masks = {name: images.parent / "masks" / f"{name}.png" for name in names}
-    frames = [
-        SourceFrame(index, name, images / name, reconstruction.cameras[name], flag, mask=masks.get(name))
-        for index, (name, flag) in enumerate(zip(names, flags, strict=True))
-    ]
+    masks = images.parent / "masks"
+    frames = []
+    for index, name in enumerate(names):
+        camera = reconstruction.cameras[name]
+        mask = masks / f"{name}.png" if masks.is_dir() else None
+        size = (camera.width, camera.height)
+        frames.append(SourceFrame(index, name, images / name, size, camera, mask=mask))
     return write_image_set(
         out,
         frames,
         source={"kind": "colmap", "path": str(model), "units": "arbitrary"},
-        transfer=options.transfer or "srgb",
-        cloud=options.points or _cloud(roots, reconstruction.points),
+        transfer="srgb",
+        cloud=_cloud(roots, reconstruction.points),
+        options=options,
         progress=progress,
     )
 

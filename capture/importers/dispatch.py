@@ -7,6 +7,8 @@ from pathlib import Path
 
 from capture.errors import SourceError
 from capture.importers.colmap import find_colmap_model, import_colmap
+from capture.importers.given_calibration import read_given_calibration, save_given_calibration
+from capture.importers.image_folder import find_pictures, import_image_folder
 from capture.importers.nerfstudio import import_nerfstudio
 from capture.importers.options import ImportOptions, Progress, no_progress
 from capture.importers.posed import import_posed
@@ -22,17 +24,28 @@ def import_source(
     """Makes a session of a source.
 
     Args:
-        source: one folder or file (a posed image set, a COLMAP model or project, a nerfstudio set), or the
-            videos of one capture.
+        source: one folder or file (a posed image set, a COLMAP model or project, a nerfstudio set), a folder
+            of plain pictures, or the videos of one capture.
         out: session folder to make; one that an interrupted import of the same source left is completed.
         options: what the source does not say.
         progress: is told what is done and how much of it.
 
     Raises:
         SourceError: the source is of no known kind, or malformed.
+        CalibrationError: the calibration given with it is malformed.
+        TaggingError: which frames are lit is not given and cannot be seen.
         SessionError: `out` is in use.
     """
     progress = progress or no_progress
+    given = read_given_calibration(options.calibration) if options.calibration is not None else None
+    session = _import(source, out, options, progress)
+    if given is not None:
+        save_given_calibration(given, session)
+    return session
+
+
+def _import(source: Sequence[Path], out: Path, options: ImportOptions, progress: Progress) -> Session:
+    """The session, without the calibration that the user gives."""
     paths = [Path(path) for path in source]
     if not paths:
         raise SourceError("There is nothing to import: name a folder, a model, a transforms.json or videos.")
@@ -53,9 +66,16 @@ def import_source(
         return import_colmap(model, out, options, progress)
     if path.is_dir() and (videos := sorted(filter(_is_video, path.iterdir()))):
         return _import_videos(videos, out, options, progress)
+    if path.is_dir() and find_pictures(path):
+        if options.poses is not None:
+            raise SourceError(
+                f"--poses is for videos; put {options.poses.name} beside the pictures of {path} as "
+                "cameras.json and import the folder."
+            )
+        return import_image_folder(path, out, options, progress)
     raise SourceError(
         f"{path} is no source that can be imported: a folder needs cameras.json, transforms.json, a COLMAP "
-        "model (or sparse/0 and images/) or videos; a file must be a .json of these or a video "
+        "model (or sparse/0 and images/), videos or pictures; a file must be a .json of these or a video "
         f"({', '.join(sorted(VIDEO_SUFFIXES))})."
     )
 
@@ -63,6 +83,10 @@ def import_source(
 def _import_videos(videos: Sequence[Path], out: Path, options: ImportOptions, progress: Progress) -> Session:
     from capture.importers.open_camera import import_videos  # loads the video libraries, for videos only
 
+    if options.without:
+        raise SourceError(
+            "--without is for image sets; a video brings only its pictures: leave out --poses and --points."
+        )
     return import_videos(videos, out, options, progress)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -13,39 +13,16 @@ import numpy as np
 
 from capture.atomic import atomic_write
 from capture.calibration_file import Quantity, write_calibration_entries
-from capture.cameras import Camera
 from capture.errors import ImageError, SourceError
 from capture.images import IMAGE_SUFFIXES, image_size, read_image, write_png
-from capture.importers.options import Progress
+from capture.importers.flash_list import read_flash_list
+from capture.importers.options import ImportOptions, Progress
+from capture.importers.source_frame import SourceFrame
+from capture.importers.still_flash import tag_source_frames
 from capture.ply import PointCloud, read_ply, write_ply
 from capture.session import FrameRecord, Session
 
 logger = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True, eq=False)
-class SourceFrame:
-    """A frame of an image set.
-
-    Attributes:
-        index: its number in the session.
-        name: what the source calls it.
-        picture: its file; None = the source has only a camera, and the frame is recorded without a picture.
-        camera: intrinsics and pose.
-        flash: 1, 0 or None = unknown.
-        split: "train", "val" or None.
-        mask: 255 = subject; None = none.
-        pts_s: time in seconds.
-    """
-
-    index: int
-    name: str
-    picture: Path | None
-    camera: Camera
-    flash: int | None = None
-    split: str | None = None
-    mask: Path | None = None
-    pts_s: float | None = None
 
 
 def write_image_set(
@@ -55,6 +32,7 @@ def write_image_set(
     source: Mapping[str, Any],
     transfer: str,
     cloud: Path | PointCloud | None,
+    options: ImportOptions,
     progress: Progress,
     calibration: Mapping[str, Quantity] | None = None,
 ) -> Session:
@@ -63,22 +41,47 @@ def write_image_set(
     Pictures are copied byte for byte. Everything is checked before the first file is written. An interrupted
     session of the same source is completed.
 
+    Args:
+        out: session folder to make.
+        frames: with what the source says of them.
+        source: for session.json.
+        transfer: of the pictures, as the source says or as is usual.
+        cloud: the source's own.
+        options: what the user says instead, and wants left out.
+        progress: is told what is done.
+        calibration: what the source says of the flash.
+
     Raises:
         SourceError: a picture or mask is missing, of another size than its camera, or of no known format.
+        TaggingError: the flash was to be told from the pictures, and cannot be.
     """
-    with_pictures = [frame for frame in frames if frame.picture is not None]
-    if not with_pictures:
+    if all(frame.picture is None for frame in frames):
         raise SourceError(
             "None of the frames names a picture: these are cameras only. Import the video with --poses."
         )
+    frames = apply_options(frames, options)
+    with_pictures = [frame for frame in frames if frame.picture is not None]
     for done, frame in enumerate(with_pictures):
         _check_picture(frame)
         progress("checking pictures", (done + 1) / len(with_pictures))
+    posed = {frame.index: frame.camera for frame in with_pictures if frame.camera is not None}
+    warnings: list[str] = []
+    cloud = choose_cloud(cloud, options, bool(posed), warnings)
     points = read_ply(cloud) if isinstance(cloud, Path) else cloud
     masks = _existing_masks(with_pictures)
+    transfer = options.transfer or transfer
+    info: dict[str, Any] = {}
+    unsaid = not posed and all(frame.flash is None for frame in frames)
+    if options.flash_list is None and ("flash" in options.without or unsaid):
+        frames, tags = tag_source_frames(frames, transfer, progress)
+        warnings += tags.warnings
+        info["tagging"] = {"log_gain": tags.log_gain, "separation": tags.separation}
 
-    first = with_pictures[0].camera
-    with _open_or_create(out, source, first.width, first.height, transfer) as session:
+    width, height = with_pictures[0].size
+    source = describe_source(source, options, bool(posed))
+    with _open_or_create(out, source, width, height, transfer) as session:
+        if warnings or info:
+            session.update_info(warnings=warnings, **info)
         present = {record.index for record in session.frames}
         for done, frame in enumerate(frames):
             if frame.index not in present:
@@ -86,7 +89,8 @@ def write_image_set(
             if (mask := masks.get(frame.index)) is not None:
                 _copy_mask(mask, frame, session)
             progress("copying pictures", (done + 1) / len(frames))
-        session.save_scene_cameras({frame.index: frame.camera for frame in with_pictures})
+        if posed:
+            session.save_scene_cameras(posed)
         if isinstance(cloud, Path):
             atomic_write(session.points_path, cloud.read_bytes())
         elif points is not None:
@@ -96,6 +100,54 @@ def write_image_set(
             write_calibration_entries(session.calibration_path, entries)
         session.finish()
     return session
+
+
+def apply_options(frames: Sequence[SourceFrame], options: ImportOptions) -> list[SourceFrame]:
+    """The frames without what the user wants left out, and with what the user gives instead.
+
+    Raises:
+        SourceError: a flash list or masks that do not fit.
+    """
+    names = [frame.name for frame in frames]
+    left_out: dict[str, Any] = {}
+    for part, field in (("poses", "camera"), ("masks", "mask"), ("flash", "flash")):
+        if part in options.without:
+            left_out[field] = None
+    frames = [replace(frame, **left_out) for frame in frames]
+    if options.flash_list is not None:
+        flags = read_flash_list(options.flash_list, names)
+        frames = [replace(frame, flash=flag) for frame, flag in zip(frames, flags, strict=True)]
+    masks = named_masks(options.masks, names)
+    return [replace(frame, mask=masks.get(frame.name, frame.mask)) for frame in frames]
+
+
+def choose_cloud(
+    own: Path | PointCloud | None, options: ImportOptions, posed: bool, warnings: list[str]
+) -> Path | PointCloud | None:
+    """The user's cloud, else the source's own; none without poses, in whose world it would have to be.
+
+    Raises:
+        SourceError: the user gives a cloud and there are no poses.
+    """
+    if options.points is not None:
+        if not posed:
+            raise SourceError(
+                f"{options.points} cannot be placed: the pictures come without poses, and those found later "
+                "have a world of their own. Leave --points out, or give the poses too."
+            )
+        return options.points
+    if own is None or "points" in options.without:
+        return None
+    if not posed:
+        warnings.append("The source's points were left out with its poses, in whose world they are.")
+        return None
+    return own
+
+
+def describe_source(source: Mapping[str, Any], options: ImportOptions, posed: bool) -> dict[str, Any]:
+    """What session.json says of the source: without a unit of length where there are no poses."""
+    said = {key: value for key, value in source.items() if posed or key != "units"}
+    return said | ({"without": sorted(options.without)} if options.without else {})
 
 
 def natural_order(name: str) -> list[tuple[int, str]]:
@@ -135,7 +187,7 @@ def named_masks(folder: Path | None, names: Iterable[str]) -> dict[str, Path]:
 
 
 def _check_picture(frame: SourceFrame) -> None:
-    picture, camera = frame.picture, frame.camera
+    picture = frame.picture
     assert picture is not None
     if picture.suffix.lower() not in IMAGE_SUFFIXES:
         raise SourceError(
@@ -145,10 +197,10 @@ def _check_picture(frame: SourceFrame) -> None:
         width, height = image_size(picture)
     except ImageError as cause:
         raise SourceError(f"Frame {frame.index}: {cause}") from cause
-    if (width, height) != (camera.width, camera.height):
+    if (width, height) != frame.size:
         raise SourceError(
             f"Frame {frame.index} ({picture}) is {width} x {height} pixels, its camera says "
-            f"{camera.width} x {camera.height}; use the pictures that the cameras were "
+            f"{frame.size[0]} x {frame.size[1]}; use the pictures that the cameras were "
             "computed from, unrotated and in full size."
         )
 
@@ -175,7 +227,7 @@ def _open_or_create(out: Path, source: Mapping[str, Any], width: int, height: in
 
 def _copy(frame: SourceFrame, session: Session) -> FrameRecord:
     """Copies a frame's picture and gives its record."""
-    reasons = () if frame.flash is not None else ("untagged",)
+    reasons = frame.remarks or (() if frame.flash is not None else ("untagged",))
     file = None
     if frame.picture is not None:
         suffix = {".jpeg": ".jpg", ".tiff": ".tif"}.get(suffix := frame.picture.suffix.lower(), suffix)
@@ -183,10 +235,11 @@ def _copy(frame: SourceFrame, session: Session) -> FrameRecord:
     return FrameRecord(
         index=frame.index,
         file=file,
-        width=frame.camera.width,
-        height=frame.camera.height,
+        width=frame.size[0],
+        height=frame.size[1],
         pts_s=frame.pts_s,
         flash=frame.flash,
+        confidence=frame.confidence,
         split=frame.split,
         reasons=reasons if file else (*reasons, "no_picture"),
         source=frame.name,
@@ -199,10 +252,10 @@ def _copy_mask(mask: Path, frame: SourceFrame, session: Session) -> None:
         pixels = read_image(mask)
     except ImageError as cause:
         raise SourceError(f"Frame {frame.index}: {cause}") from cause
-    if pixels.shape[:2] != (frame.camera.height, frame.camera.width):
+    if pixels.shape[1::-1] != frame.size:
         raise SourceError(
             f"Frame {frame.index}: the mask {mask} is {pixels.shape[1]} x {pixels.shape[0]} pixels, the "
-            f"picture {frame.camera.width} x {frame.camera.height}."
+            f"picture {frame.size[0]} x {frame.size[1]}."
         )
     target = session.mask_path(frame.index)
     target.parent.mkdir(parents=True, exist_ok=True)

@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from capture.cameras import LARGEST_SIDE, Camera, check_intrinsics, check_rotation, nearest_rotation
 from capture.errors import ImageError, SourceError
 from capture.images import image_size
-from capture.importers.flash_list import read_flash_list
-from capture.importers.image_set import SourceFrame, named_masks, write_image_set
+from capture.importers.image_set import write_image_set
 from capture.importers.options import ImportOptions, Progress
+from capture.importers.source_frame import SourceFrame
 from capture.json_fields import Fields, read_json
 from capture.ply import PointCloud, read_ply
 from capture.session import Session
@@ -44,33 +44,32 @@ def import_nerfstudio(path: Path, out: Path, options: ImportOptions, progress: P
     entries = list(fields.children("frames", "frame"))
     if not entries:
         raise fields.fail('"frames" is empty: there is no camera to use.')
-    names = [_file_name(entry, path.parent) for entry in entries]
-    flags = [entry.integer("flash", None, 0, 1) for entry in entries]
-    if options.flash_list is not None:
-        flags = read_flash_list(options.flash_list, names)
-    masks = named_masks(options.masks, names)
     splits = _splits(fields)
     frames = []
-    for index, (entry, name, flag) in enumerate(zip(entries, names, flags, strict=True)):
+    for index, entry in enumerate(entries):
+        name = _file_name(entry, path.parent)
         picture = path.parent / name
+        camera = _camera(entry, fields, picture, file_from_original)
         mask = entry.text("mask_path", None)
         frames.append(
             SourceFrame(
                 index=index,
                 name=name,
                 picture=picture,
-                camera=_camera(entry, fields, picture, file_from_original),
-                flash=flag,
+                size=(camera.width, camera.height),
+                camera=camera,
+                flash=entry.integer("flash", None, 0, 1),
                 split=splits.get(name),
-                mask=masks.get(name, path.parent / mask if mask else None),
+                mask=path.parent / mask if mask else None,
             )
         )
     return write_image_set(
         out,
         frames,
         source={"kind": "nerfstudio", "path": str(path), "units": "arbitrary"},
-        transfer=options.transfer or "srgb",
-        cloud=options.points or _cloud(fields, path.parent, file_from_original),
+        transfer="srgb",
+        cloud=_cloud(fields, path.parent, file_from_original),
+        options=options,
         progress=progress,
     )
 

@@ -12,9 +12,9 @@ from pathlib import Path
 from capture.calibration_file import Quantity
 from capture.cameras import PosedSet, load_posed_set
 from capture.errors import SourceError
-from capture.importers.flash_list import read_flash_list
-from capture.importers.image_set import SourceFrame, named_masks, write_image_set
+from capture.importers.image_set import write_image_set
 from capture.importers.options import ImportOptions, Progress
+from capture.importers.source_frame import SourceFrame
 from capture.session import Session
 
 
@@ -25,30 +25,28 @@ def import_posed(path: Path, out: Path, options: ImportOptions, progress: Progre
         SourceError: the file is malformed, or a picture, mask or cloud is missing or does not fit.
     """
     posed_set = load_posed_set(path)
-    names = [_name(frame.file, posed_set.root, frame.camera.name) for frame in posed_set.frames]
-    flags = [frame.flash for frame in posed_set.frames]
-    if options.flash_list is not None:
-        flags = read_flash_list(options.flash_list, names)
-    masks = named_masks(options.masks, names)
     frames = [
         SourceFrame(
             index=frame.index,
-            name=name,
+            name=_name(frame.file, posed_set.root, frame.camera.name),
             picture=frame.file,
+            size=(frame.camera.width, frame.camera.height),
             camera=frame.camera,
-            flash=flag,
+            flash=frame.flash,
             split=frame.split,
-            mask=masks.get(name, frame.mask),
+            mask=frame.mask,
             pts_s=frame.pts_s,
         )
-        for frame, name, flag in zip(posed_set.frames, names, flags, strict=True)
+        for frame in posed_set.frames
     ]
+    own_cloud = posed_set.root / "points.ply"
     return write_image_set(
         out,
         frames,
         source={"kind": "posed", "path": str(path), "name": posed_set.name, "units": posed_set.units},
-        transfer=options.transfer or posed_set.transfer,
-        cloud=_cloud(posed_set.root, options),
+        transfer=posed_set.transfer,
+        cloud=own_cloud if own_cloud.is_file() else None,
+        options=options,
         progress=progress,
         calibration=_calibration(posed_set),
     )
@@ -58,11 +56,6 @@ def _name(file: Path | None, root: Path, camera_name: str) -> str:
     if file is None:
         return camera_name
     return (file.relative_to(root) if file.is_relative_to(root) else file).as_posix()
-
-
-def _cloud(root: Path, options: ImportOptions) -> Path | None:
-    own = root / "points.ply"
-    return options.points or (own if own.is_file() else None)
 
 
 def _calibration(posed_set: PosedSet) -> dict[str, Quantity]:

@@ -12,20 +12,15 @@ from capture.errors import TaggingError
 from capture.frame_record import FrameRecord
 from capture.session import Session
 from capture.tagging.config import TaggingConfig
-from capture.tagging.profiles import FrameProfiles, ProfileAccumulator
-from capture.tagging.result import FlashPrior, TagResult
-from capture.tagging.split import BLOCKS, split_frames
+from capture.tagging.profiles import ProfileAccumulator
+from capture.tagging.result import FlashPrior, FrameTag, TagResult
+from capture.tagging.stills import tag_stills
 from capture.tagging.tagger import tag
 
 # Frames at least so often are a video, in which pulses have edges; fewer are stills.
 _VIDEO_HZ = 12.0
-# Stills have no time; the split gets them at this pace, which makes a still's nearest neighbours its
-# reference.
-_STILL_INTERVAL_S = 1 / 6
-# Scores between these are neither lit nor unlit.
-_UNLIT, _LIT = 0.3, 0.7
-# Half of the stills may be lit: a flash and a no-flash picture from each place.
-_MOST_LIT = 0.6
+# Stills have no time; their order is what counts.
+_STILL_INTERVAL_S = 1.0
 
 
 def tag_frames(
@@ -62,8 +57,7 @@ def tag_session(session: Session, *, config: TaggingConfig | None = None) -> lis
     """The records of a session with the flash filled in where it was unknown; nothing is written.
 
     A session of a video (many frames a second, all with their pictures) is tagged as one. Stills in the
-    order in which they were taken are split by their light against their neighbours'; there are no rows'
-    times to see a partial flash by.
+    order in which they were taken are tagged by their light against their neighbours' (`stills`).
 
     Raises:
         TaggingError: the classes cannot be told apart.
@@ -83,40 +77,18 @@ def tag_session(session: Session, *, config: TaggingConfig | None = None) -> lis
         accumulator.add(
             session.load_image(record), float(times[number]) if video else _STILL_INTERVAL_S * number
         )
-    tagged = (
-        _tag_video(kept, accumulator.profiles(), config)
-        if video
-        else _tag_stills(kept, accumulator.profiles(), config)
-    )
+    profiles = accumulator.profiles()
+    tags = tag(profiles, config=config).frames if video else tag_stills(profiles, config).frames
+    tagged = [_with_tag(record, frame) for record, frame in zip(kept, tags, strict=True)]
     known = {old.index: new if old.flash is None else old for old, new in zip(kept, tagged, strict=True)}
     return [known.get(record.index, record) for record in session.frames]
 
 
-def _tag_video(
-    records: list[FrameRecord], profiles: FrameProfiles, config: TaggingConfig
-) -> list[FrameRecord]:
-    return [
-        replace(
-            record,
-            flash=frame.flash,
-            lit_fraction=frame.lit_fraction,
-            confidence=frame.confidence,
-            reasons=tuple(dict.fromkeys((*record.reasons, *frame.reasons))),
-        )
-        for record, frame in zip(records, tag(profiles, config=config).frames, strict=True)
-    ]
-
-
-def _tag_stills(
-    records: list[FrameRecord], profiles: FrameProfiles, config: TaggingConfig
-) -> list[FrameRecord]:
-    split = split_frames(profiles.pts_s, profiles.blocks(BLOCKS, BLOCKS), config, most_lit=_MOST_LIT)
-    out = []
-    for record, score in zip(records, split.score, strict=True):
-        flash = 0 if score < _UNLIT else 1 if score > _LIT else None
-        # distance from the middle in spreads, as odds
-        confidence = 1 / (1 + float(np.exp(-min(abs(score - 0.5) / max(split.spread, 0.02), 50.0))))
-        reasons = record.reasons if flash is not None else (*record.reasons, "flash_uncertain")
-        lit = None if flash is None else float(flash)
-        out.append(replace(record, flash=flash, lit_fraction=lit, confidence=confidence, reasons=reasons))
-    return out
+def _with_tag(record: FrameRecord, frame: FrameTag) -> FrameRecord:
+    return replace(
+        record,
+        flash=frame.flash,
+        lit_fraction=frame.lit_fraction,
+        confidence=frame.confidence,
+        reasons=tuple(dict.fromkeys((*record.reasons, *frame.reasons))),
+    )
