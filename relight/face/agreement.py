@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from relight.face.plane import Floats
-from relight.face.samples import Samples, albedo_agreement
+from relight.face.samples import Samples
 
 BEYOND_CELLS = 2.5
 """Cells along the surface from the nearest sample, from which on a place counts as not observed."""
@@ -75,15 +75,12 @@ def _scored(
     seen = (along < BEYOND_CELLS * samples.cell) | (np.abs(across) > along)
     alike = np.exp(-0.5 * (across / tolerance) ** 2) * np.clip((turned * facing).sum(axis=-1), 0.0, 1.0) ** 2
     alike *= along < BEYOND_CELLS * samples.cell
-    if samples.albedo is not None:
-        alike *= albedo_agreement(samples.albedo[which][:, None], samples.albedo[ids], ALBEDO_TOLERANCE)
-    weight = samples.weights[which, None] * samples.weights[ids]
-    total = samples.weights[which, None] * np.ones_like(weight)
-    checked = (weight * seen).sum(axis=0)
-    agreeing = (weight * seen * alike).sum(axis=0)
-    unseen = np.maximum(total.sum(axis=0) - checked, 0.0)
+    alike *= samples.albedo_agreement(which[:, None], ids, ALBEDO_TOLERANCE)
+    checked = seen.sum(axis=0)
+    agreeing = (seen * alike).sum(axis=0)
+    unseen = len(which) - checked
     return (
         agreeing / np.maximum(checked + _UNSEEN_PRICE * unseen, 1e-12),
         agreeing / np.maximum(checked, 1e-12),
-        checked / np.maximum(total.sum(axis=0), 1e-12),
+        checked / max(1, len(which)),
     )

@@ -43,13 +43,13 @@ def decide(symmetry: Symmetry | None, frame: HeadFrame | None) -> FaceDecision:
     if symmetry.agreement < _LEAST_AGREEMENT:
         return FaceDecision(
             False,
-            f"nothing in the scene is symmetric as a face is: at best {symmetry.agreement:.0%} of the surface "
+            f"nothing here is symmetric as a face is: at best {symmetry.agreement:.0%} of the surface "
             f"agrees with its mirror image (at least {_LEAST_AGREEMENT:.0%} is needed)",
         )
     if symmetry.overlap < _LEAST_OVERLAP:
         return FaceDecision(
             False,
-            f"only {symmetry.overlap:.0%} of the surface was seen on both sides of its plane of symmetry (at "
+            f"only {symmetry.overlap:.0%} of the surface was seen on both sides of its mirror plane (at "
             f"least {_LEAST_OVERLAP:.0%} is needed); film the other half of the face too",
         )
     if symmetry.rival > _MOST_RIVAL:

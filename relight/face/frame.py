@@ -1,7 +1,7 @@
 """A head's own axes and size, and the nose: what tells a face from anything else that is symmetric.
 
-The frame stands on the plane of symmetry. `left` is its normal towards the subject's left, `up` the world's up
-brought into the plane, `forward` where the face looks. The unit of everything is `breadth`, the head's own.
+The frame stands on the plane of symmetry. `left` is its normal towards the subject's left, `up` the world's
+up brought into it, `forward` where the face looks. The unit of everything is `breadth`, the head's own.
 
 A nose is found in the profile: at each height, how far the middle stands out before the cheeks beside it. A
 ball or a helmet stands out a little at every height, the edge of a box much at every height; a nose does at
@@ -98,7 +98,9 @@ def head_frame(points: Floats, normals: Floats, plane: Plane, up: Floats, toward
 
 def _breadth(side: Floats) -> float:
     """Twice the distance of the outermost points; of the wider side, for the other may be cut off."""
-    reach = [float(np.percentile(side[side * sign > 0] * sign, 97)) for sign in (-1, 1) if (side * sign > 0).any()]
+    reach = [
+        float(np.percentile(side[side * sign > 0] * sign, 97)) for sign in (-1, 1) if (side * sign > 0).any()
+    ]
     return 2.0 * max(reach)
 
 

@@ -60,7 +60,7 @@ def head_floor(points: Floats, up: Floats, towards: Floats) -> float:
 
 
 def _above_shoulders(breadths: Floats, neck: int, widest: float, step: float) -> float:
-    """Depth below the crown that leaves the chin in, which may hang below the neck's level, but no shoulder."""
+    """Depth below the crown that leaves the chin in, which may hang below the neck's level, no shoulder."""
     level = neck
     while level > 0 and breadths[level] > _SHOULDERS * widest:
         level -= 1

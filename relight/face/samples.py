@@ -32,7 +32,7 @@ class Samples:
         points: [N, 3] float64, world.
         normals: [N, 3] float64, unit.
         albedo: [N, 3] float64 relative to the cloud's median, None = not known.
-        weights: [N] 0..1, how much each is to be trusted.
+        trust: [N] 0..1, how far each albedo is to be trusted.
         cell: Side of a cell, world units.
         radius: Half the typical breadth of the cloud (robust), world units.
         nearest: [X, Y, Z] int32, id of the sample nearest to each cell of a larger lattice.
@@ -42,7 +42,7 @@ class Samples:
     points: NDArray[np.float64]
     normals: NDArray[np.float64]
     albedo: NDArray[np.float64] | None
-    weights: NDArray[np.float64]
+    trust: NDArray[np.float64]
     cell: float
     radius: float
     nearest: NDArray[np.int32]
@@ -56,9 +56,28 @@ class Samples:
         found: NDArray[np.int32] = self.nearest[index[..., 0], index[..., 1], index[..., 2]]
         return found
 
+    def albedo_agreement(
+        self, first: NDArray[np.int64], second: NDArray[np.int32], tolerance: float
+    ) -> NDArray[np.float64]:
+        """How alike the albedos of samples are, 0..1; 1 where it is not known.
+
+        Args:
+            first: [...] ids.
+            second: [...] ids.
+            tolerance: Difference relative to the mean that still agrees (standard deviation).
+        """
+        if self.albedo is None:
+            return np.ones(np.broadcast_shapes(first.shape, second.shape))
+        one, other = self.albedo[first], self.albedo[second]
+        total = (one + other).mean(axis=-1) + 2 * _ALBEDO_FLOOR
+        relative = np.abs(one - other).mean(axis=-1) / total
+        alike = np.exp(-0.5 * (2.0 * relative / tolerance) ** 2)
+        trust = np.minimum(self.trust[first], self.trust[second])
+        return np.asarray(1.0 - trust + trust * alike)
+
 
 def take_samples(
-    points: Floats, normals: Floats, albedo: Floats | None, weights: Floats | None = None
+    points: Floats, normals: Floats, albedo: Floats | None, trust: Floats | None = None
 ) -> Samples | None:
     """Thins a cloud to samples, and leaves out what is not finite or has no neighbours.
 
@@ -66,7 +85,7 @@ def take_samples(
         points: [P, 3], world.
         normals: [P, 3]; zero or not finite = unknown, such points are left out.
         albedo: [P, 3] linear, or None.
-        weights: [P] 0..1, or None.
+        trust: [P] 0..1, how far the albedo is known; None = everywhere.
 
     Returns:
         None where too little is left to speak of a shape.
@@ -104,26 +123,19 @@ def take_samples(
     if albedo is not None:
         mean_albedo = averaged(albedo[kept])[enough]
         mean_albedo = mean_albedo / max(float(np.median(mean_albedo.mean(axis=1))), 1e-9)
-    own = np.ones(len(counts)) if weights is None else averaged(weights[kept, None])[:, 0]
+    own = np.ones(len(counts)) if trust is None else averaged(trust[kept, None])[:, 0]
     nearest, origin = _nearest_lattice(mean_points, cell)
     spread = np.percentile(mean_points, [5, 95], axis=0)
     return Samples(
         points=mean_points,
         normals=mean_normals[enough] / agreement[enough, None],
         albedo=mean_albedo,
-        weights=own[enough].clip(0.0, 1.0),
+        trust=own[enough].clip(0.0, 1.0),
         cell=cell,
         radius=0.5 * float(np.sort(spread[1] - spread[0])[1]),
         nearest=nearest,
         origin=origin,
     )
-
-
-def albedo_agreement(first: Floats, second: Floats, tolerance: float) -> NDArray[np.float64]:
-    """How alike two albedos [..., 3] are, 0..1: a Gaussian of their difference relative to their sum."""
-    total = first + second + 2 * _ALBEDO_FLOOR
-    relative = np.abs(first - second).mean(axis=-1) / total.mean(axis=-1)
-    return np.asarray(np.exp(-0.5 * (2.0 * relative / tolerance) ** 2), dtype=np.float64)
 
 
 def _with_neighbours(points: Floats) -> NDArray[np.int64]:

@@ -1,9 +1,9 @@
 """The face unrolled: for each texel of a symmetric texture the point of the surface and its normal.
 
-A cylinder about the head's upright axis. Columns run from the subject's right (0) to the left (255): as one
-sees a face in a picture. Column j and 255 - j are mirror images: the plane of symmetry is the seam between
-columns 127 and 128, and the left half of the texture is the subject's right. Row 0 is at the top. A texel lies
-where the ray from the axis leaves the head (the outermost surface).
+A cylinder about the head's upright axis. Columns run from the subject's right (0) to the left (255), as
+one sees a face in a picture. Column j and 255 - j are mirror images: the plane of symmetry is the seam
+between columns 127 and 128; the left half of the texture is the subject's right. Row 0 is at the top. A
+texel lies where the ray from the axis leaves the head (the outermost surface).
 """
 
 from __future__ import annotations
@@ -34,6 +34,7 @@ _GAP = 3.0  # typical distances between points over which the surface is interpo
 _ROLLED = 0.6  # breadths from axis to surface, typically: what an angle is worth
 _FACE_ANGLE_RAD = 1.22  # half-width of the face at the height of the nose: 70 degrees, before the ears
 _FACE_TOP, _FACE_BOTTOM = 0.68, -0.56
+_NECK = 0.75  # of the face's radius: what lies deeper is the neck under the jaw
 _SKIN_RATIO = (0.4, 2.5)  # albedo of skin over the median of nose and cheeks; brows and lips are filled
 
 
@@ -112,7 +113,7 @@ def unroll(points: Floats, normals: Floats, albedo: Floats | None, frame: HeadFr
         points=_tensor(world.reshape(*shape, 3)),
         normals_world=_tensor(normal.reshape(*shape, 3)),
         valid=torch.from_numpy(valid),
-        region=torch.from_numpy(_region(valid, colours)),
+        region=torch.from_numpy(_region(valid, reach.reshape(shape), colours)),
         albedo=None if colours is None else _tensor(colours),
     )
 
@@ -141,12 +142,16 @@ def _outermost(angle: Floats, height: Floats, radius: Floats) -> NDArray[np.int6
     return kept
 
 
-def _region(valid: NDArray[np.bool_], albedo: NDArray[np.float64] | None) -> NDArray[np.bool_]:
-    """Where the face is: an oval, and in it what is connected to the nose and has an albedo like it."""
+def _region(
+    valid: NDArray[np.bool_], radius: NDArray[np.float64], albedo: NDArray[np.float64] | None
+) -> NDArray[np.bool_]:
+    """Where the face is: an oval without the neck, and in it what hangs together with the nose."""
     rows, columns = texel_places()
     middle, half = 0.5 * (_FACE_TOP + _FACE_BOTTOM), 0.5 * (_FACE_TOP - _FACE_BOTTOM)
     across, along = np.abs(columns / _FACE_ANGLE_RAD)[None], np.abs((rows - middle) / half)[:, None]
     oval = (across**2.5 + along**2.5 < 1.0) & valid
+    if oval.any():
+        oval &= radius > _NECK * float(np.median(radius[oval]))
     if albedo is None:
         return oval
     level = albedo.mean(axis=-1)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from relight.face.agreement import BEYOND_CELLS, mirror_agreement
 from relight.face.plane import Floats, Plane
-from relight.face.samples import Samples, albedo_agreement
+from relight.face.samples import Samples
 
 _AZIMUTH_STEP_DEG = 6.0
 _TILTS_DEG = (-24.0, -16.0, -8.0, 0.0, 8.0, 16.0, 24.0)
@@ -33,6 +33,7 @@ _RIVAL_DEG = 15.0  # planes further apart than this, or by _RIVAL_OFFSET radii, 
 _RIVAL_OFFSET = 0.25
 _COARSE = 0.08  # of the radius: distances that still agree, in the search
 _FINE = 0.03
+_ALBEDO_TOLERANCE = 0.5  # wider than in the search: only what is clearly another thing goes
 _BLOCKS = 8
 _STEPS = 12
 
@@ -73,10 +74,7 @@ def find_symmetry(samples: Samples, up: Floats) -> Symmetry:
     which = _spread(len(samples.points), _SEARCH_SAMPLES)
     coarse = mirror_agreement(samples, which, normals, offsets, _COARSE * samples.radius)
     candidates = _different(normals, offsets - normals @ middle, coarse.score, samples.radius)
-    planes = [
-        _refine(samples, Plane.of(normals[k], float(offsets[k])), np.ones(len(samples.points), bool))
-        for k in candidates
-    ]
+    planes = [refine_plane(samples, Plane.of(normals[k], float(offsets[k]))) for k in candidates]
     which = _spread(len(samples.points), _SCORE_SAMPLES)
     fine = mirror_agreement(
         samples,
@@ -163,8 +161,18 @@ def _rival(
     return float(min(1.0, max(refined, searched)))
 
 
-def _refine(samples: Samples, plane: Plane, used: NDArray[np.bool_], steps: int = _STEPS) -> Plane:
-    """The plane moved so that mirror images fall onto the tangent planes of the points that they meet."""
+def refine_plane(
+    samples: Samples, plane: Plane, used: NDArray[np.bool_] | None = None, steps: int = _STEPS
+) -> Plane:
+    """The plane moved so that mirror images fall onto the tangent planes of the points that they meet.
+
+    Args:
+        samples: The cloud.
+        plane: To begin with, right to some 10 degrees and a quarter of the radius.
+        used: [N] bool, which samples take part; None = all.
+        steps: At most.
+    """
+    used = np.ones(len(samples.points), bool) if used is None else used
     which = np.flatnonzero(used)
     points, normals = samples.points[which], samples.normals[which]
     for step in range(steps):
@@ -175,10 +183,9 @@ def _refine(samples: Samples, plane: Plane, used: NDArray[np.bool_], steps: int 
         across = (way * facing).sum(axis=1)
         along = np.sqrt(np.maximum((way * way).sum(axis=1) - across**2, 0.0))
         cosine = (turned * facing).sum(axis=1)
-        weight = samples.weights[which] * samples.weights[ids] * (along < BEYOND_CELLS * samples.cell)
-        weight = weight * used[ids] * np.clip(cosine, 0.0, 1.0) ** 4 / (1.0 + (across / tolerance) ** 2) ** 2
-        if samples.albedo is not None:
-            weight = weight * albedo_agreement(samples.albedo[which], samples.albedo[ids], 0.5)
+        weight = (along < BEYOND_CELLS * samples.cell) * used[ids]
+        weight = weight * np.clip(cosine, 0.0, 1.0) ** 4 / (1.0 + (across / tolerance) ** 2) ** 2
+        weight = weight * samples.albedo_agreement(which, ids, _ALBEDO_TOLERANCE)
         moved = _step(plane, points, facing, across, weight)
         if moved is None:
             return plane
@@ -202,9 +209,7 @@ def _step(plane: Plane, points: Floats, facing: Floats, across: Floats, weight: 
     centred = points - middle
     height = plane.distance(points)
     along_n = facing @ n
-    columns = [
-        -2.0 * ((centred @ axis) * along_n + height * (facing @ axis)) for axis in (first, second)
-    ]
+    columns = [-2.0 * ((centred @ axis) * along_n + height * (facing @ axis)) for axis in (first, second)]
     jacobian = np.stack([*columns, 2.0 * along_n], axis=1)
     left = jacobian.T @ (weight[:, None] * jacobian)
     right = -jacobian.T @ (weight * across)
@@ -234,7 +239,7 @@ def _jackknife(samples: Samples, plane: Plane, middle: Floats) -> tuple[float, f
     block = order * _BLOCKS // len(order)
     tilts, shifts = [], []
     for left_out in range(_BLOCKS):
-        moved = _refine(samples, plane, block != left_out, steps=5)
+        moved = refine_plane(samples, plane, block != left_out, steps=5)
         sign = np.sign(moved.n @ plane.n)
         tilts.append(sign * moved.n - plane.n)
         shifts.append(float(sign * moved.distance(middle) - plane.distance(middle)))
