@@ -17,6 +17,7 @@ class CameraPath:
             subject's left).
         distance_m: mean distance from the head's centre; it wanders by about 8 %.
         elevation_deg: mean height of the camera above the head's centre, as an angle.
+        sway: factor on the slow wandering of distance, height, aim and roll; 0 = an exact arc.
         tremor: factor on the shaking of the hands; 0 = a rail.
         target: [3] what it is pointed at, metres, world.
         seed: of sway and tremor.
@@ -26,6 +27,7 @@ class CameraPath:
     sweep_deg: float = 165.0
     distance_m: float = 0.58
     elevation_deg: float = 2.0
+    sway: float = 1.0
     tremor: float = 1.0
     target: tuple[float, float, float] = (0.0, -0.035, 0.0)
     seed: int = 0
@@ -35,7 +37,7 @@ class CameraPath:
         part = float(np.clip(time_s / self.duration_s, 0.0, 1.0))
         eased = part - 0.35 * np.sin(2 * np.pi * part) / (2 * np.pi)  # slow at both ends
         azimuth = np.radians(self.sweep_deg) * (eased - 0.5)
-        sway = self._wander(time_s, 0, (0.11, 0.23, 0.41))
+        sway = self.sway * self._wander(time_s, 0, (0.11, 0.23, 0.41))
         tremor = self.tremor * self._wander(time_s, 10, (1.1, 2.7, 5.3, 8.9))
         elevation = np.radians(self.elevation_deg + 2.5 * sway[0])
         distance = self.distance_m * (1.0 + 0.05 * sway[1])

@@ -5,8 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from capture.sim.camera_path import CameraPath
+from capture.sim.decor import DecorConfig
+from capture.sim.head_motion import HeadMotion
 from capture.sim.lamp import LampConfig
 from capture.sim.sensor import SensorConfig
+from capture.sim.shake import ShakeConfig
 from capture.sim.subject import Subject
 
 
@@ -17,11 +20,14 @@ class RigConfig:
     Attributes:
         subject: who sits there.
         room_seed: of wallpaper, books and pictures.
+        decor: what else the room looks like.
         width: of the upright picture, pixels.
         height: of the upright picture, pixels.
         focal_px: focal length, pixels.
         fps: nominal frame rate.
         path: the hand's motion; its duration is the recording's.
+        motion: of the sitter.
+        shake: frames blurred by the hand.
         lamp: the flash and its timer.
         sensor: rolling shutter, noise and drift.
         flash_offset_cam_m: [3] flash position in the axes of the stored pictures' camera.
@@ -29,7 +35,7 @@ class RigConfig:
         room_level: radiance of a white surface that faces the front of the room.
         rotation_deg: clockwise turn from the stored picture to the upright one: 0, 90, 180, 270.
         posed_frames: number of frames of a posed set.
-        flash_every: every so many frames of a posed set have the flash on.
+        flash_every: every so many frames of a posed set have the flash on; 1 = all, 0 = none.
         validation_views: extra cameras with ground truth beside a video.
         cloud_points: points in the simulated dense cloud.
         cell_mm: grid of the sculpted mesh; the face's is finer by 2 ** subdivisions.
@@ -45,11 +51,14 @@ class RigConfig:
 
     subject: Subject = field(default_factory=Subject)
     room_seed: int = 0
+    decor: DecorConfig = field(default_factory=DecorConfig)
     width: int = 480
     height: int = 640
     focal_px: float = 690.0
     fps: float = 30.0
     path: CameraPath = field(default_factory=CameraPath)
+    motion: HeadMotion = field(default_factory=HeadMotion)
+    shake: ShakeConfig = field(default_factory=ShakeConfig)
     lamp: LampConfig = field(default_factory=LampConfig)
     sensor: SensorConfig = field(default_factory=SensorConfig)
     flash_offset_cam_m: tuple[float, float, float] = (0.013, -0.007, 0.0)
@@ -73,6 +82,8 @@ class RigConfig:
     def __post_init__(self) -> None:
         if self.rotation_deg not in (0, 90, 180, 270):
             raise ValueError(f"rotation_deg {self.rotation_deg} must be 0, 90, 180 or 270")
+        if self.flash_every < 0:
+            raise ValueError(f"flash_every {self.flash_every} must be 0 or more")
         if self.width % 2 or self.height % 2 or min(self.width, self.height) < 16:
             raise ValueError(f"{self.width} x {self.height}: both sides must be even and at least 16 pixels")
 

@@ -120,6 +120,23 @@ class Environment:
         )
 
 
+@dataclass(frozen=True, eq=False)
+class TurnedEnvironment:
+    """An environment as one sees it who has turned in it.
+
+    Attributes:
+        environment: the light.
+        turn: [3, 3] from the turned axes to the environment's.
+    """
+
+    environment: Environment
+    turn: np.ndarray
+
+    def cells(self, directions: np.ndarray) -> np.ndarray:
+        """As `Environment.cells`, of directions in the turned axes."""
+        return self.environment.cells(directions @ self.turn.T)
+
+
 @dataclass(frozen=True)
 class SoftBox:
     """A glow in an environment: towards a direction, so many radians wide, of a radiance."""

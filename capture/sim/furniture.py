@@ -24,6 +24,8 @@ LEFT, RIGHT, FLOOR, CEILING, BACK, FRONT = -1.6, 1.6, -1.25, 1.25, -1.6, 2.0
 
 _PLASTER = (0.70, 0.68, 0.64)
 _CLAY = (0.35, 0.12, 0.07)
+_BARE_WALL = (0.62, 0.61, 0.58)
+_DAYLIGHT = (1.9, 2.0, 2.2)
 _LAMP = (2.1, 1.75, 1.3)  # radiance; the room's light is scaled as a whole later
 
 
@@ -78,6 +80,23 @@ def _box(low: Vector, high: Vector, front: Texture, side: Texture) -> list[Panel
         _rectangle((x0, y1, z0), (0, 0, z1 - z0), (0, y0 - y1, 0), side),
         _rectangle((x0, y1, z0), (x1 - x0, 0, 0), (0, 0, z1 - z0), side),
     ]
+
+
+def bare_room() -> list[Panel]:
+    """The panels of a room without furniture, pictures or texture; its lights are behind the camera."""
+    wide, high, deep = RIGHT - LEFT, CEILING - FLOOR, FRONT - BACK
+    wall = plain_texture(_BARE_WALL)
+    walls = [
+        _rectangle((LEFT, CEILING, BACK), (wide, 0, 0), (0, -high, 0), wall, 0.02),
+        _rectangle((RIGHT, CEILING, BACK), (0, 0, deep), (0, -high, 0), wall, 0.02),
+        _rectangle((LEFT, CEILING, FRONT), (0, 0, -deep), (0, -high, 0), wall, 0.02),
+        _rectangle((RIGHT, CEILING, FRONT), (-wide, 0, 0), (0, -high, 0), wall, 0.02),
+        _rectangle((LEFT, FLOOR, BACK), (wide, 0, 0), (0, 0, deep), wall, 0.02),
+        _rectangle((LEFT, CEILING, FRONT), (wide, 0, 0), (0, 0, -deep), plain_texture(_PLASTER), 0.02),
+    ]
+    window = _rectangle((1.0, 1.0, FRONT - 0.01), (-2.0, 0, 0), (0, -1.25, 0), plain_texture(_DAYLIGHT), 0.02)
+    lamp = _rectangle((-0.5, CEILING - 0.01, 1.2), (0.7, 0, 0), (0, 0, -0.4), plain_texture(_LAMP), 0.02)
+    return [*walls, _glowing(window), _glowing(lamp)]
 
 
 def furnish(seed: int) -> list[Panel]:

@@ -8,7 +8,7 @@ readout, the same + exposure].
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -29,7 +29,8 @@ class LampConfig:
         rise_s: time from dark to full.
         fall_s: time from full to dark.
         droop: share of light lost from the beginning to the end of a pulse.
-        missed: probability that a pulse does not happen.
+        missed: probability that a pulse does not happen; 1 = the lamp never lights.
+        always_on: the lamp burns from before the recording to after it.
         seed: of wander, jitter and misses.
     """
 
@@ -42,6 +43,7 @@ class LampConfig:
     fall_s: float = 0.001
     droop: float = 0.01
     missed: float = 0.0
+    always_on: bool = False
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -73,6 +75,8 @@ class PulseTrain:
     @classmethod
     def schedule(cls, config: LampConfig, duration_s: float) -> PulseTrain:
         """The pulses that begin before `duration_s`."""
+        if config.always_on:
+            return cls(replace(config, droop=0.0), (Pulse(-1.0, duration_s + 1.0),))
         rng = np.random.default_rng([config.seed, 77])
         pulses, at = [], config.first_s
         while at < duration_s:

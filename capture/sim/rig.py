@@ -10,7 +10,7 @@ for frame in rig.frames():
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -19,7 +19,7 @@ from capture.cameras import Camera
 from capture.sim.ahead import computed_ahead
 from capture.sim.bust import Bust, build_bust
 from capture.sim.config import RigConfig
-from capture.sim.environment import Environment, SoftBox, studio_map
+from capture.sim.environment import Environment, SoftBox, TurnedEnvironment, studio_map
 from capture.sim.lamp import PulseTrain
 from capture.sim.room import PANORAMA_ROWS, Room
 from capture.sim.shading import (
@@ -75,6 +75,7 @@ class FrameTruth:
         on_s: when the pulse that lights it begins; None without one.
         off_s: when that pulse ends.
         dropped_before: frames lost just before this one.
+        shaken: the hand jerked during the exposure.
     """
 
     index: int
@@ -86,6 +87,7 @@ class FrameTruth:
     on_s: float | None
     off_s: float | None
     dropped_before: int
+    shaken: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,7 +135,10 @@ class Rig:
         room_light: the room as seen from the head.
         studio: the first novel environment ("env1").
         sunset: the second ("env2").
-        passed: what arrives past the sitter's own body of room_light, studio and sunset: [V, 3] each.
+        passed: what arrives past the sitter's own body of room_light, studio and sunset: [V, 3] each, the
+            chair not turned.
+        passed_turned: [V, 3] the same of room_light for each of the chair's `key_angles_deg`; empty when
+            it does not turn.
         room_diffuse: [V, 3] diffuse radiance of the sitter under the room's light.
         pulses: the lamp's pulses.
     """
@@ -147,27 +152,44 @@ class Rig:
     passed: tuple[np.ndarray, ...]
     room_diffuse: np.ndarray
     pulses: PulseTrain
+    passed_turned: tuple[np.ndarray, ...] = ()
 
     @classmethod
     def build(cls, config: RigConfig, progress: Progress | None = None) -> Rig:
         """Sculpt the sitter, furnish the room, trace the broad shadows."""
         say = progress or (lambda step, part: None)
         say("furnish the room", 0.0)
-        room = Room.build(config.room_seed, config.room_level)
+        room = Room.build(config.room_seed, config.room_level, config.decor)
         room_light = Environment.from_map(room.panorama(PANORAMA_ROWS))
         studio, sunset = Environment.from_map(_STUDIO), Environment.from_map(_SUNSET)
         say("sculpt the head", 0.2)
         bust = build_bust(config.subject, config.cell_mm, config.subdivisions, config.strands)
         say("trace shadows", 0.7)
-        shadows = BroadShadows.trace(bust, [room_light, studio, sunset], config.shadow_directions)
-        diffuse = environment_diffuse(bust, room_light, shadows.passed[0])
+        motion = config.motion
+        turned = [TurnedEnvironment(room_light, motion.chair(angle)) for angle in motion.key_angles_deg()]
+        lights: list[Environment | TurnedEnvironment] = [room_light, studio, sunset]
+        lights += turned if motion.turn_deg else []
+        passed = BroadShadows.trace(bust, lights, config.shadow_directions).passed
+        diffuse = environment_diffuse(bust, room_light, passed[0])
         pulses = PulseTrain.schedule(config.lamp, config.path.duration_s)
         say("rig ready", 1.0)
-        return cls(config, bust, room, room_light, studio, sunset, shadows.passed, diffuse, pulses)
+        return cls(config, bust, room, room_light, studio, sunset, passed[:3], diffuse, pulses, passed[3:])
 
     def camera(self, time_s: float, name: str, flash: int | None = None) -> Camera:
-        """The phone's camera at a time of the recording, that of the stored picture."""
-        return self.camera_at(self.config.path.cam_from_world(time_s), name, flash)
+        """The phone's camera at a time of the recording, that of the stored picture, in the head's axes."""
+        return self.camera_at(self.upright_pose(time_s), name, flash)
+
+    def upright_pose(self, time_s: float) -> np.ndarray:
+        """[4, 4] cam_from_head at a time of the recording, of the upright picture."""
+        cam_from_room = self.config.path.cam_from_world(time_s)
+        room_from_head = self.room_from_head(time_s)
+        return cam_from_room if room_from_head is None else cam_from_room @ room_from_head
+
+    def room_from_head(self, time_s: float) -> np.ndarray | None:
+        """[4, 4] where the head is at a time of the recording; None = where the room was built around it."""
+        if self.config.motion.still:
+            return None
+        return self.config.motion.room_from_head(time_s / self.config.path.duration_s)
 
     def camera_at(self, upright_cam_from_world: np.ndarray, name: str, flash: int | None = None) -> Camera:
         """The phone's camera at an upright pose [4, 4]."""
@@ -187,15 +209,26 @@ class Rig:
             self.config.flash_offset_cam_m
         )
 
-    def layers(self, camera: Camera, flash: bool) -> Layers:
-        """Noise-free pictures of the room's light and, if wanted, of the flash."""
+    def layers(self, camera: Camera, flash: bool, room_from_head: np.ndarray | None = None) -> Layers:
+        """Noise-free pictures of the room's light and, if wanted, of the flash.
+
+        Args:
+            camera: in the head's axes.
+            flash: whether the flash's part is wanted.
+            room_from_head: [4, 4] where the head is; None = where the room was built around it.
+        """
         c, bust = self.config, self.bust
         eye, lamp = camera.centre_world, self.flash_position(camera)
         chosen = facing_vertices(bust, eye)
+        in_room, turn, passed = camera, None, self.passed[0]
         radiance = self.room_diffuse.copy()
-        radiance[chosen] += environment_gloss(bust, self.room_light, self.passed[0], eye, chosen)
+        if room_from_head is not None:
+            in_room = replace(camera, cam_from_world=camera.cam_from_world @ np.linalg.inv(room_from_head))
+            turn, passed = room_from_head[:3, :3], self._passed_at(room_from_head)
+            radiance = environment_diffuse(bust, self.room_light, passed, turn)
+        radiance[chosen] += environment_gloss(bust, self.room_light, passed, eye, chosen, turn)
         sitter = draw_layer(bust, camera, radiance, c.supersampling)
-        behind, behind_flash = self.room.draw(camera, lamp if flash else None)
+        behind, behind_flash = self.room.draw(in_room, self.flash_position(in_room) if flash else None)
         through = 1.0 - sitter.coverage[..., None]
         room = sitter.radiance + through * self._defocus(behind)
         if behind_flash is None:
@@ -205,6 +238,33 @@ class Rig:
         radiance[chosen] = point_light(bust, lamp, color, chosen, eye)
         lit = draw_layer(bust, camera, radiance, c.supersampling)
         return Layers(room, lit.radiance + through * self._defocus(behind_flash) * color, sitter.coverage)
+
+    def _passed_at(self, room_from_head: np.ndarray) -> np.ndarray:
+        """[V, 3] of the room's light that arrives: between those of the nearest angles of the chair.
+
+        That the head tips by some degrees changes it little, and is left out.
+        """
+        if not self.passed_turned:
+            return self.passed[0]
+        angle = np.degrees(np.arctan2(room_from_head[0, 2], room_from_head[2, 2]))
+        keys = self.config.motion.key_angles_deg()
+        place = float(np.interp(angle, keys, np.arange(len(keys))))
+        low = min(int(place), len(keys) - 2)
+        weight = np.float32(place - low)
+        return (1 - weight) * self.passed_turned[low] + weight * self.passed_turned[low + 1]
+
+    def expose(self, radiance: np.ndarray, camera: Camera, time_s: float, index: int) -> np.ndarray:
+        """[H, W, 3] uint8: the stored picture of a frame's radiance, shaken, with the exposure of its time.
+
+        Args:
+            radiance: [H, W, 3] noise-free.
+            camera: of the frame.
+            time_s: of the middle of its exposure.
+            index: of its noise and its shake.
+        """
+        gains = self.config.sensor.gains(time_s / self.config.path.duration_s)
+        shaken = self.config.shake.blur(radiance, camera, index)
+        return self.config.sensor.develop((shaken * gains).astype(np.float32), index)
 
     def _defocus(self, picture: np.ndarray) -> np.ndarray:
         """The room, out of focus by a pixel or so as it is behind a head at half a metre."""
@@ -233,11 +293,10 @@ class Rig:
         camera = self.camera(middle_s, f"{index:04d}")
         lit = self.pulses.lit_fraction(start_s, camera.height, sensor.readout_s, sensor.exposure_s)
         flash = self.pulses.flag(lit)
-        layers = self.layers(camera, bool(lit.max() > 0))
+        layers = self.layers(camera, bool(lit.max() > 0), self.room_from_head(middle_s))
         radiance = layers.room * sensor.row_flicker(start_s, camera.height)[:, None, None]
         if layers.flash is not None:
             radiance = radiance + lit[:, None, None] * layers.flash
-        radiance = radiance * sensor.gains(middle_s / c.path.duration_s)
         end_s = start_s + sensor.readout_s + sensor.exposure_s
         near = [p for p in self.pulses.pulses if p.on_s < end_s and p.off_s + c.lamp.fall_s > start_s]
         pulse = near[0] if near and lit.max() > 0 else None
@@ -251,7 +310,7 @@ class Rig:
             on_s=pulse.on_s if pulse else None,
             off_s=pulse.off_s if pulse else None,
             dropped_before=exposure.dropped_before,
+            shaken=c.shake.blurs(exposure.tick),
         )
-        return RigFrame(
-            start_s, sensor.develop(radiance.astype(np.float32), exposure.tick), camera, lit, truth
-        )
+        rgb = self.expose(radiance, camera, middle_s, exposure.tick)
+        return RigFrame(start_s, rgb, camera, lit, truth)

@@ -13,8 +13,10 @@ import cv2
 import numpy as np
 
 from capture.cameras import Camera
+from capture.sim.decor import DecorConfig
 from capture.sim.environment import latlong_directions
-from capture.sim.furniture import Panel, furnish
+from capture.sim.furniture import Panel, bare_room, furnish
+from capture.sim.markers import PLACES, Marker
 from capture.sim.rasterize import Raster, project
 
 PANORAMA_ROWS = 64  # of the map that lights the sitter
@@ -53,6 +55,7 @@ class Room:
         triangles: [T, 3] int32.
         radiance: [A, B, 3] float32 atlas of what the panels send out under the room's own light.
         albedo: [A, B, 3] float32 atlas of their reflectance; 0 where glowing.
+        markers: those that hang in it.
     """
 
     vertices: np.ndarray
@@ -61,11 +64,17 @@ class Room:
     triangles: np.ndarray
     radiance: np.ndarray
     albedo: np.ndarray
+    markers: tuple[Marker, ...] = ()
 
     @classmethod
-    def build(cls, seed: int, level: float) -> Room:
+    def build(cls, seed: int, level: float, decor: DecorConfig | None = None) -> Room:
         """A furnished room; at the origin a white surface that faces its front has the radiance `level`."""
-        panels = furnish(seed)
+        decor = decor or DecorConfig()
+        panels = bare_room() if decor.plain else furnish(seed)
+        markers: list[Marker] = []
+        if decor.markers != "none":
+            papers, markers = PLACES[decor.markers](decor.marker_side_m)
+            panels += papers
         lights = [panel for panel in panels if panel.glowing]
         radiances, albedos = [], []
         mean = np.mean([_received(panel, lights, 4, 4).mean() for panel in panels if not panel.glowing])
@@ -91,6 +100,7 @@ class Room:
             room.triangles,
             (room.radiance * np.float32(level / seen)),
             room.albedo,
+            tuple(markers),
         )
 
     @classmethod

@@ -50,25 +50,43 @@ def facing_vertices(bust: Bust, eye: np.ndarray) -> np.ndarray:
     return np.nonzero(cosine > _TURNED_AWAY)[0]
 
 
-def environment_diffuse(bust: Bust, environment: Environment, passed: np.ndarray) -> np.ndarray:
-    """Diffuse radiance [V, 3] under a distant light of which the share `passed` [V, 3] arrives."""
-    return bust.albedo * look_up(environment.diffuse, bust.normals) * passed
+def environment_diffuse(
+    bust: Bust, environment: Environment, passed: np.ndarray, turn: np.ndarray | None = None
+) -> np.ndarray:
+    """Diffuse radiance [V, 3] under a distant light of which the share `passed` [V, 3] arrives.
+
+    Args:
+        bust: the sitter.
+        environment: the light.
+        passed: see `BroadShadows`.
+        turn: [3, 3] from the sitter's axes to the environment's; None = they are the same.
+    """
+    return bust.albedo * look_up(environment.diffuse, _turned(bust.normals, turn)) * passed
 
 
 def environment_gloss(
-    bust: Bust, environment: Environment, passed: np.ndarray, eye: np.ndarray, chosen: np.ndarray
+    bust: Bust,
+    environment: Environment,
+    passed: np.ndarray,
+    eye: np.ndarray,
+    chosen: np.ndarray,
+    turn: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Mirrored light [C, 3] of the chosen vertices [C] towards a viewer at `eye` [3]."""
+    """Mirrored light [C, 3] of the chosen vertices [C] towards a viewer at `eye` [3], sitter's axes."""
     normals = bust.normals[chosen]
     to_eye = _unit(eye.astype(np.float32) - bust.vertices[chosen])
     cosine = np.einsum("vc,vc->v", to_eye, normals)[:, None]
-    mirrored = 2.0 * cosine * normals - to_eye
+    mirrored = _turned(2.0 * cosine * normals - to_eye, turn)
     light = look_up(environment.mirrored, mirrored)
     wet = bust.wet[chosen]
     light[wet] = look_up(environment.mirrored_wet, mirrored[wet])
     fresnel = 1.0 + 4.0 * np.clip(1.0 - cosine, 0.0, 1.0) ** 5
     fresnel[chosen >= bust.strand_start] = 1.0
     return light * fresnel * bust.gloss[chosen, None] * passed[chosen]
+
+
+def _turned(directions: np.ndarray, turn: np.ndarray | None) -> np.ndarray:
+    return directions if turn is None else directions @ turn.T.astype(np.float32)
 
 
 def point_light(

@@ -19,6 +19,7 @@ from capture.sim.truth import write_cameras, write_clouds, write_frame, write_li
 from capture.video.writer import VideoWriter
 
 FIRST_VALIDATION_INDEX = 9000  # above any frame of a recording of the rig
+_PROBE_SPACING = 5
 _BUILD_SHARE = 0.15  # of the time, for the progress
 
 
@@ -45,15 +46,17 @@ def simulate_posed_set(
     out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
     cameras, entries = [], []
-    lit = set(range(0, config.posed_frames, config.flash_every))
-    probes = {i for i in lit if (i // config.flash_every) % 4 == 2 and i + 1 < config.posed_frames}
+    every = config.flash_every
+    lit = set(range(0, config.posed_frames, every)) if every else set()
+    spacing = every if every > 1 else _PROBE_SPACING  # all lit or none: still only some are for validation
+    probes = {i for i in range(0, config.posed_frames - 1, spacing) if (i // spacing) % 4 == 2}
     validation = {i + step for i in probes for step in (-1, 0, 1)}
     measured = validation | set(range(0, config.posed_frames, 10))
 
     def render(index: int) -> Camera:
         time_s = config.path.duration_s * (index + 0.5) / config.posed_frames
         camera = rig.camera(time_s, f"{index:04d}", flash=int(index in lit))
-        write_frame(rig, camera, out, noise_index=index)
+        write_frame(rig, camera, out, time_s=time_s, noise_index=index)
         if index in measured:
             write_view(rig, camera, out, relight=index in probes or index + 1 in probes)
         return camera
@@ -61,9 +64,8 @@ def simulate_posed_set(
     for index, camera in enumerate(computed_ahead(render, range(config.posed_frames))):
         say("render the posed set", _BUILD_SHARE + (0.97 - _BUILD_SHARE) * index / config.posed_frames)
         cameras.append(camera)
-        entries.append(
-            _posed_entry(camera, index, "val" if index in validation else "train", index in measured)
-        )
+        entry = _posed_entry(camera, index, "val" if index in validation else "train", index in measured)
+        entries.append(entry | ({"shaken": True} if config.shake.blurs(index) else {}))
     write_cameras(rig, out / "cameras.json", cameras, entries)
     chosen = sorted(validation)
     if chosen:
@@ -152,18 +154,20 @@ def _write_validation(rig: Rig, out: Path) -> None:
     if not config.validation_views:
         return
     rng = np.random.default_rng([config.path.seed, 31])
-    cameras = []
+    cameras: list[Camera] = []
+    times_s: list[float] = []
     for k in range(config.validation_views):
         time_s = config.path.duration_s * (k + 0.5) / config.validation_views
-        pose = config.path.cam_from_world(time_s)
+        pose = rig.upright_pose(time_s)
         pose[:3, 3] += rng.normal(0.0, 0.012, 3)
         cameras.append(rig.camera_at(pose, f"{FIRST_VALIDATION_INDEX + k:04d}", flash=k % 2))
+        times_s.append(time_s)
 
-    def render(camera: Camera) -> None:
-        write_frame(rig, camera, out, noise_index=None)
-        write_view(rig, camera, out, relight=True)
+    def render(k: int) -> None:
+        write_frame(rig, cameras[k], out, time_s=times_s[k], noise_index=None)
+        write_view(rig, cameras[k], out, relight=True)
 
-    for _ in computed_ahead(render, cameras):
+    for _ in computed_ahead(render, range(len(cameras))):
         pass
     entries = [_posed_entry(camera, int(camera.name), "val", True) for camera in cameras]
     write_cameras(rig, out / "cameras_val.json", cameras, entries)

@@ -23,6 +23,7 @@ from capture.images import write_exr, write_png
 from capture.ply import write_ply
 from capture.sim.cloud import sample_surface, stereo_cloud
 from capture.sim.environment import Environment
+from capture.sim.markers import described
 from capture.sim.rig import Rig
 from capture.sim.shading import (
     draw_layer,
@@ -133,25 +134,34 @@ def write_view(rig: Rig, camera: Camera, out: Path, *, relight: bool) -> None:
             write_exr(_made(out / "relight") / f"{light}_{name}.exr", radiance)
 
 
-def write_frame(rig: Rig, camera: Camera, out: Path, *, noise_index: int | None) -> None:
-    """frames/, linear/ and mask/ of one view; the 8-bit frame is noisy when it has a noise index."""
-    layers = rig.layers(camera, bool(camera.flash))
+def write_frame(rig: Rig, camera: Camera, out: Path, *, time_s: float, noise_index: int | None) -> None:
+    """frames/, linear/ and mask/ of one view at a time of the recording.
+
+    The 8-bit frame is noisy, with the shake and the exposure of its time, when it has a noise index; the
+    linear one is always sharp and at the exposure of the beginning.
+    """
+    layers = rig.layers(camera, bool(camera.flash), rig.room_from_head(time_s))
     radiance = layers.room if layers.flash is None else layers.room + layers.flash
-    sensor = rig.config.sensor
-    rgb = sensor.encode(radiance) if noise_index is None else sensor.develop(radiance, noise_index)
+    if noise_index is None:
+        rgb = rig.config.sensor.encode(radiance)
+    else:
+        rgb = rig.expose(radiance, camera, time_s, noise_index)
     write_png(_made(out / "frames") / f"{camera.name}.png", rgb)
     write_exr(_made(out / "linear") / f"{camera.name}.exr", radiance)
     write_png(_made(out / "mask") / f"{camera.name}.png", np.round(255 * layers.coverage).astype(np.uint8))
 
 
 def write_clouds(rig: Rig, out: Path) -> None:
-    """points.ply (input) and gt/surface.ply (truth)."""
+    """points.ply (input), gt/surface.ply (truth), and gt/markers.json where there are any."""
     rng = np.random.default_rng([rig.config.subject.seed, 404])
     duration_s = rig.config.path.duration_s
     cameras = [rig.camera(part * duration_s, "stereo") for part in np.linspace(0.03, 0.97, 9)]
     write_ply(out / "points.ply", stereo_cloud(rig.bust, cameras, rig.config.cloud_points, rng))
     exact = sample_surface(rig.bust, round(rig.config.cloud_points * _SURFACE_POINTS_PER_CLOUD_POINT), rng)
     write_ply(_made(out / "gt") / "surface.ply", exact)
+    if rig.room.markers:
+        markers = described(rig.room.markers, rig.config.decor.marker_side_m)
+        _write_json(out / "gt" / "markers.json", markers)
 
 
 def write_cameras(rig: Rig, path: Path, cameras: list[Camera], entries: list[dict[str, Any]]) -> None:
@@ -174,7 +184,8 @@ def write_cameras(rig: Rig, path: Path, cameras: list[Camera], entries: list[dic
         "width": first.width,
         "height": first.height,
         "units": "metres",
-        "world": "+Y up, +Z where the face looks, +X the subject's left; origin near the centre of the head",
+        "world": "+Y up, +Z where the face looks, +X the subject's left; origin near the centre of the head"
+        + ("" if rig.config.motion.still else "; it moves with the head, which moves in the room"),
         "camera_convention": "OpenCV, world-to-camera: x_cam = R x_world + t (x right, y down, z forward); "
         "u = fx x/z + cx; the CENTRE of the top-left pixel is (0.5, 0.5)",
         "K": first.K.tolist(),

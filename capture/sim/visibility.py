@@ -6,6 +6,7 @@ directions. Small lights (flash, point) get one sharp depth map each time: `poin
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,7 +14,7 @@ import numpy as np
 from capture.cameras import Camera
 from capture.sim.ahead import computed_ahead
 from capture.sim.bust import Bust
-from capture.sim.environment import Environment, fibonacci_directions
+from capture.sim.environment import Environment, TurnedEnvironment, fibonacci_directions
 from capture.sim.rasterize import Raster, project
 
 _FAR_LIGHT_M = 12.0  # so far that its rays are parallel to 1.5 degrees over the bust
@@ -84,7 +85,11 @@ class BroadShadows:
 
     @classmethod
     def trace(
-        cls, bust: Bust, environments: list[Environment], directions: int, size: int = 320
+        cls,
+        bust: Bust,
+        environments: Sequence[Environment | TurnedEnvironment],
+        directions: int,
+        size: int = 320,
     ) -> BroadShadows:
         """Depth maps of the occluder from `directions` even directions, applied to every environment."""
         towards = fibonacci_directions(directions)

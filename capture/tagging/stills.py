@@ -89,8 +89,8 @@ def tag_stills(profiles: FrameProfiles, config: TaggingConfig | None = None) -> 
     seen = np.flatnonzero(profiles.readable)
     if len(seen) < _LEAST_STILLS:
         raise TaggingError(
-            f"The flash of {len(seen)} picture{'s' * (len(seen) != 1)} cannot be told: at least {_LEAST_STILLS} "
-            "are needed, lit and unlit ones; name the lit ones in a flash list."
+            f"The flash of {len(seen)} picture{'s' * (len(seen) != 1)} cannot be told: at least "
+            f"{_LEAST_STILLS} are needed, lit and unlit ones; name the lit ones in a flash list."
         )
     light = np.stack([profiles.linear(int(k)) for k in seen]).astype(np.float64)
     model = _fit(_region_levels(light))
