@@ -46,6 +46,14 @@ def test_missed_pulses_leave_gaps_and_no_pulse_leaves_darkness() -> None:
     assert not none.lit_fraction(0.5, 8, 0.02, 0.01).any()
 
 
+def test_a_lamp_that_always_burns_lights_every_row_of_every_frame() -> None:
+    train = PulseTrain.schedule(LampConfig(always_on=True), 4.0)
+    for start_s in (0.0, 1.3, 3.97):
+        fraction = train.lit_fraction(start_s, 32, 0.02, 0.008)
+        assert np.allclose(fraction, 1.0)
+        assert train.flag(fraction) == 1
+
+
 @pytest.mark.parametrize("wrong", [{"rise_s": 0.0}, {"on_s": 0.01}, {"period_s": 0.1}])
 def test_a_lamp_that_cannot_be_is_refused(wrong: dict[str, float]) -> None:
     with pytest.raises(ValueError, match=next(iter(wrong))):

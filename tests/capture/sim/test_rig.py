@@ -111,6 +111,13 @@ def test_the_hand_moves_smoothly_half_around_the_head() -> None:
     assert all(np.allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3)) for pose in poses[::60])
 
 
+def test_a_path_without_sway_and_tremor_is_an_exact_arc_and_may_be_two_centimetres_long() -> None:
+    path = CameraPath(sweep_deg=2.0, sway=0.0, tremor=0.0, elevation_deg=0.0)
+    centres = np.array([-p[:3, :3].T @ p[:3, 3] for p in map(path.cam_from_world, np.linspace(0, 16, 33))])
+    assert np.linalg.norm(centres - np.array(path.target), axis=1) == pytest.approx([0.58] * 33)
+    assert np.linalg.norm(centres[-1] - centres[0]) == pytest.approx(0.02, abs=0.001)
+
+
 def test_seeds_give_different_people_within_measured_reflectances() -> None:
     people = [Subject.from_seed(seed) for seed in range(30)]
     assert len(set(people)) == 30
@@ -123,6 +130,8 @@ def test_seeds_give_different_people_within_measured_reflectances() -> None:
 def test_impossible_rigs_are_refused() -> None:
     with pytest.raises(ValueError, match="rotation_deg 45"):
         RigConfig(rotation_deg=45)
+    with pytest.raises(ValueError, match="flash_every -1"):
+        RigConfig(flash_every=-1)
     with pytest.raises(ValueError, match="even"):
         RigConfig(width=481)
     with pytest.raises(ValueError, match="mohawk"):

@@ -45,6 +45,31 @@ def test_a_posed_set_reads_back_with_its_pictures(posed: Path, small_rig: Rig) -
         assert read_image(frame.mask).dtype == np.uint8
 
 
+@pytest.mark.parametrize(("every", "flag"), [(0, 0), (1, 1)])
+def test_the_flash_of_a_posed_set_may_never_fire_or_always(
+    small_rig: Rig, tmp_path: Path, every: int, flag: int
+) -> None:
+    config = replace(small_rig.config, flash_every=every)
+    posed_set = load_posed_set(simulate_posed_set(tmp_path, config, rig=replace(small_rig, config=config)))
+    assert {frame.flash for frame in posed_set.frames} == {flag}
+    assert [frame.index for frame in posed_set.frames if frame.split == "val"] == [9, 10, 11]
+
+
+def test_exposure_drifts_over_a_posed_set_but_not_in_its_linear_truth(
+    small_rig: Rig, posed: Path, tmp_path: Path
+) -> None:
+    sensor = replace(small_rig.config.sensor, exposure_drift=0.4)
+    config = replace(small_rig.config, sensor=sensor)
+    drifting = simulate_posed_set(tmp_path, config, rig=replace(small_rig, config=config)).parent
+    for name, part in (("0000", 0.5 / 12), ("0011", 11.5 / 12)):
+        linear = read_exr(posed / f"linear/{name}.exr")
+        assert np.array_equal(linear, read_exr(drifting / f"linear/{name}.exr"))
+        stored = to_linear(read_image(drifting / f"frames/{name}.png"), "srgb")
+        mid = (linear > 0.1) & (linear < 0.5)
+        # 8-bit codes and noise average out over thousands of pixels.
+        assert np.median(stored[mid] / linear[mid]) == pytest.approx(1 + 0.4 * part, rel=0.01)
+
+
 def test_truth_files_have_the_forms_that_tools_read(posed: Path) -> None:
     validation = load_posed_set(posed / "cameras_val.json")
     assert [frame.camera.name for frame in validation.frames] == ["0009", "0010", "0011"]
