@@ -7,7 +7,8 @@ nothing, with one 1.5 cm off hardly anything, with one 10 cm off a few per cent.
 
 Per candidate scale the flash's part of the frames is fitted with one albedo a point and one gain a frame, and
 the robust misfit compared. The uncertainty comes from leaving out frames one block after the other: normals
-and shadows err alike in neighbouring points, which the misfit's curvature alone does not know.
+and shadows err alike in neighbouring points, which the misfit's curvature alone does not know. What errs alike
+in all frames is added to it.
 """
 
 from __future__ import annotations
@@ -35,6 +36,7 @@ _LEAST_COSINE = 0.25  # below, normals err too much
 _MOST_POINTS = 3000
 _VIEW_WIDTH_RAD = 0.15
 _ROBUST = 0.08  # relative misfit that still counts in full
+_SYSTEMATIC = 0.006  # share of the shading that gloss and normals imitate alike in all frames
 _DARK = 0.01  # flash radiance that is lost in noise
 
 
@@ -139,7 +141,8 @@ def scale_from_flash(samples: FlashSamples, flash_offset_cam_m: Floats, expected
     values = np.array(without, float)
     sigma = float(np.sqrt((len(blocks) - 1) / len(blocks) * ((values - values.mean()) ** 2).sum()))
     scale = expected * float(np.exp(best))
-    return FlashScale(scale, sigma, _share(samples, offset, scale))
+    share = _share(samples, offset, scale)
+    return FlashScale(scale, float(np.hypot(sigma, _SYSTEMATIC / share)), share)
 
 
 def _misfits(samples: FlashSamples, offset: NDArray[np.float64], frames: NDArray[np.int64]) -> Floats:
