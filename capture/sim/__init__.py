@@ -16,8 +16,9 @@ printed markers.
 
 Not modelled: light that bounces between parts of the sitter or goes through skin; a neck that bends, a face
 that moves (the sitter is one rigid piece); a shadow of the sitter on the room's walls; blur by the path's own
-motion, and the bending of moving edges by the rolling shutter (each frame has one pose); lens distortion, vignetting, flare, focus hunting; sharpening and noise reduction
-of the phone; sound. The room's light is taken as distant: the same over the whole head but for shadows.
+motion, and the bending of moving edges by the rolling shutter (each frame has one pose); lens distortion,
+vignetting, flare, focus hunting; sharpening and noise reduction of the phone; sound. The room's light is
+taken as distant: the same over the whole head but for shadows.
 
 Modules in the order in which a photon meets them: lamp and room, bust (head, eyes, skin, hair), shading,
 head_motion, camera_path, shake, sensor, rig, truth; `simulate` writes the folders.

@@ -5,7 +5,7 @@ linear/NAME.exr, mask/NAME.png                  the noise-free frame; coverage 0
 gt/albedo_NAME.exr, normal_, depth_NAME.png     reflectance; world normals; z in 0.05 mm (0 = no head)
 relight/LIGHT_NAME.exr, relight/env1.exr        the sitter under novel lights; and the environments
 points.ply, gt/surface.ply                      the noisy input cloud; exact points for measuring
-gt/markers.json                                 corners of printed markers, in the room's axes; if there are any
+gt/markers.json                                 corners of printed markers, in the room's axes, if any
 """
 
 from __future__ import annotations
