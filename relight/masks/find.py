@@ -14,7 +14,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TypeVar
 
@@ -37,11 +37,14 @@ from relight.masks.silhouette import Silhouette, silhouette
 from relight.masks.solve import prior, solve
 from relight.masks.subject import SubjectCloud, find_subject
 from relight.masks.sweep import carried, neighbours, register
+from relight.masks.tune import Agreement, network_mask, tune
+from relight.masks.u2net import load_u2net, network_input
 from relight.stages import Progress, no_progress
 
 _HULL_VIEWS = 12
 _FINEST_PX = 1280  # longest side at which outlines are sought; masks of larger frames are enlarged
 _MOST_WORKERS = 4
+_NETWORK_LIMIT = 3.0  # log-odds
 
 _Result = TypeVar("_Result")
 
@@ -105,6 +108,7 @@ def find_masks(
         done += 1
         progress("masks", min(1.0, done / total))
 
+    agreement = _add_network(state) if config.u2net else None
     _add_flash(state)
     for _, (index, odds) in _each(state.frames, lambda frame: (frame.index, _evidence(state, frame))):
         state.odds[index] = odds
@@ -130,7 +134,8 @@ def find_masks(
     seconds = time.perf_counter() - started_s
     return MaskResult(
         keep=keep,
-        report=report(outcomes, state.separations, keep, subject, config, seconds),
+        report=report(outcomes, state.separations, keep, subject, config, seconds)
+        | ({} if agreement is None else {"network_tuning": asdict(agreement)}),
         warnings=warnings(outcomes, state.separations, keep, config, [frame.flash for frame in state.frames]),
     )
 
@@ -147,6 +152,32 @@ def _each(frames: Sequence[Frame], work: Callable[[Frame], _Result]) -> Iterator
         for start in range(0, len(frames), 2 * workers):
             batch = frames[start : start + 2 * workers]
             yield from zip(batch, pool.map(work, batch), strict=True)
+
+
+def _add_network(state: _State) -> Agreement | None:
+    """The network's masks as log-odds; its weights tuned for agreement first, if asked for."""
+    config = state.config
+    network = load_u2net(Path(config.u2net))
+
+    def picture(frame: Frame) -> torch.Tensor:
+        return network_input(state.source.radiance(frame))
+
+    agreement = None
+    if config.tune_steps:
+        agreement = tune(
+            network,
+            picture,
+            state.frames,
+            state.subject,
+            config.tune_steps,
+            config.tune_rate,
+            config.outside_share,
+        )
+    for frame in state.frames:
+        mask = np.clip(network_mask(network, picture(frame), frame), 1e-6, 1.0 - 1e-6)
+        odds = np.log(mask / (1.0 - mask))
+        state.odds[frame.index] = np.clip(odds, -_NETWORK_LIMIT, _NETWORK_LIMIT).astype(np.float16)
+    return agreement
 
 
 def _add_flash(state: _State) -> None:
