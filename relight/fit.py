@@ -1,4 +1,4 @@
-"""From a session to a portrait: plan, scene, solve, pictures, report; each step a function of its own module.
+"""From a session to a portrait: plan, geometry, solve, pictures, report; each step in a module of its own.
 
 portraits/NAME/portrait.safetensors, portrait.json   the portrait
                config.json                           the resolved configuration of the solve
@@ -21,9 +21,12 @@ from typing import Any
 import torch
 
 from capture.atomic import atomic_write
+from capture.json_fields import parse_json
 from capture.session import Session
+from relight.derive import derive_scene
 from relight.devices import choose_device, describe_device
 from relight.errors import PlanError
+from relight.geometry_plan import GEOMETRY_STAGES, GeometryConfig
 from relight.photometric import SolveConfig, solve
 from relight.plan import Action, Plan
 from relight.planning import make_plan
@@ -31,6 +34,7 @@ from relight.portrait import Portrait
 from relight.previews import write_previews
 from relight.report import write_report
 from relight.scene import load_scene
+from relight.stage_cache import StageCache
 from relight.stages import Progress, Stages, memory_summary, no_progress
 from relight.version import installed_version
 
@@ -48,6 +52,8 @@ def fit(
     max_seconds: float | None = None,
     name: str | None = None,
     forced: Mapping[str, Action] | None = None,
+    geometry: GeometryConfig | None = None,
+    fresh: bool = False,
     progress: Progress = no_progress,
 ) -> Path:
     """Fits a portrait and writes everything that belongs to it.
@@ -59,25 +65,41 @@ def fit(
         max_seconds: Time that the fit should end within; the plan leaves frames out until it does.
         name: What to call the portrait; its preset's name by default. One of that name is replaced.
         forced: Decisions of the plan to turn round.
+        geometry: How poses, cloud and masks are found where the session does not bring them.
+        fresh: Whether to do again what an earlier run left, though nothing that it depends on has changed.
         progress: Told (stage, fraction).
 
     Returns:
         The portrait's folder.
 
     Raises:
+        GeometryError: Poses, cloud or masks cannot be found in the frames.
         PlanError: The session cannot be fitted, or an argument is not one of those known.
     """
     _check_preset(preset)
+    geometry = geometry or GeometryConfig()
     torch_device = choose_device(device)
     name = preset if name is None else name
     if not _NAME.fullmatch(name):
         raise PlanError(f"A portrait cannot be called {name!r}; use letters, digits, '_', '-' and '.'.")
     opened = Session.open(session)
+    if fresh:
+        StageCache(opened).forget_all()
     stages = Stages()
     with stages.stage("plan"):
-        plan = make_plan(opened, forced, max_seconds)
+        plan = make_plan(opened, forced, max_seconds, geometry)
     plan.check()
+    if any(plan.runs(stage) for stage in GEOMETRY_STAGES):
+        derive_scene(opened, plan, geometry, torch_device, stages, progress)
+        with stages.stage("plan"):
+            plan = make_plan(opened, forced, max_seconds, geometry).after(plan)
+        plan.check()
     config = SolveConfig()
+    folder = opened.portraits_dir / name
+    cache = StageCache(opened)
+    key = _solve_key(opened, cache, plan, config, torch_device)
+    if not fresh and _is_current(folder, key):
+        return folder
     with stages.follow(progress) as told:
         scene = load_scene(
             opened,
@@ -88,18 +110,47 @@ def fit(
         )
         portrait = solve(scene, config, told)
 
-    folder = opened.portraits_dir / name
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "evaluation.json").unlink(missing_ok=True)  # it measured the portrait that is replaced now
+    for outdated in ("evaluation.json", "config.json"):  # they belong to the portrait that is replaced now
+        (folder / outdated).unlink(missing_ok=True)
     with stages.stage("save"):
         portrait.save(folder)
-        _write_json(folder / "config.json", {"preset": preset, "solve": asdict(config)})
         _write_json(folder / "plan.json", plan.as_json())
     with stages.stage("previews"):
         write_previews(portrait, opened, folder / "previews", progress)
-    _write_json(folder / "metrics.json", _metrics(plan, portrait, stages, torch_device))
+    metrics = _metrics(plan, portrait, stages, torch_device)
+    _write_json(
+        folder / "metrics.json", {**metrics, "geometry": cache.reports(), "warnings": cache.warnings()}
+    )
+    # Last, because its key says that all of the portrait is there.
+    resolved = {"key": key, "preset": preset, "solve": asdict(config), "geometry": asdict(geometry)}
+    _write_json(folder / "config.json", resolved)
     write_report(session, name)
     return folder
+
+
+def _solve_key(
+    session: Session, cache: StageCache, plan: Plan, config: SolveConfig, device: torch.device
+) -> str:
+    """Of all that a portrait depends on."""
+    fitted = frozenset(plan.frames)
+    frames = [record for record in session.frames if record.index in fitted]
+    settings = {**asdict(config), "undistort": plan.runs("undistortion"), "device": describe_device(device)}
+    inputs = [*(cache.identity(stage) for stage in ("poses", "cloud", "masks")), installed_version()]
+    return cache.key("solve", settings, frames, inputs)
+
+
+def _is_current(folder: Path, key: str) -> bool:
+    """Whether the portrait there is whole and is what the fit would give."""
+    whole = all(
+        (folder / file).is_file() for file in ("portrait.json", "portrait.safetensors", "report.html")
+    )
+    if not whole or not (folder / "config.json").is_file():
+        return False
+    try:
+        return bool(parse_json((folder / "config.json").read_bytes()).get("key") == key)
+    except (OSError, ValueError, AttributeError):
+        return False
 
 
 def _check_preset(preset: str) -> None:

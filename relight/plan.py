@@ -5,6 +5,7 @@ A decision is one of
     run     the step is needed
     skip    the scene does not need it; the same result without
     given   the session brings the step's result
+    kept    an earlier run left the result, and nothing that it depends on has changed
     refuse  the fit cannot be done as the session is; the reason says what to add
 
 Where both ways are possible the decision can be forced (`FORCEABLE`). Only steps that this version has are
@@ -14,13 +15,13 @@ decided.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import Any
 
 from relight.errors import PlanError
 
-FORCEABLE = ("undistortion", "redundant_views", "room_shading")
+FORCEABLE = ("undistortion", "redundant_views", "room_shading", "masks")
 """Decisions that `--force NAME=run|skip` may turn round."""
 
 
@@ -30,6 +31,7 @@ class Action(StrEnum):
     RUN = "run"
     SKIP = "skip"
     GIVEN = "given"
+    KEPT = "kept"
     REFUSE = "refuse"
 
 
@@ -75,6 +77,15 @@ class Plan:
     def runs(self, name: str) -> bool:
         """Whether the step is done."""
         return self.decision(name).action is Action.RUN
+
+    def after(self, earlier: Plan) -> Plan:
+        """This plan, made when the steps of an earlier one were done, with the earlier one's word on them."""
+        ran = {decision.name: decision for decision in earlier.decisions if decision.action is Action.RUN}
+        decisions = (
+            ran[decision.name] if decision.action is Action.KEPT and decision.name in ran else decision
+            for decision in self.decisions
+        )
+        return replace(self, decisions=tuple(decisions), estimated_s=earlier.estimated_s)
 
     def check(self) -> None:
         """Does nothing for a session that can be fitted.

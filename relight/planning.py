@@ -1,6 +1,7 @@
 """Looks at a session and decides what a fit of it runs and what it skips.
 
-Each step has one function that returns its `Decision`. Only steps that this version has are decided.
+Each step has one function that returns its `Decision`; those of the geometry are in `relight.geometry_plan`.
+Only steps that this version has are decided.
 """
 
 from __future__ import annotations
@@ -14,8 +15,10 @@ from capture.cameras import Camera
 from capture.frame_record import EXCLUDING_REASONS, FrameRecord
 from capture.ply import PointCloud, read_ply
 from capture.session import Session
+from relight.geometry_plan import GeometryConfig, plan_geometry
 from relight.lens import distortion_px
 from relight.plan import Action, Decision, Plan
+from relight.stage_cache import StageCache
 from relight.view_redundancy import redundant_views
 
 NORMAL_FLASH_VIEWS = 3
@@ -39,24 +42,35 @@ _SAMPLED_FRAMES = 5  # of each kind, for the dark-room test: their mean is known
 _SECONDS = 8.0
 _SECONDS_PER_POINT = 3e-5
 _SECONDS_PER_FRAME = 0.08
+_POINTS_FOUND = 150_000  # of a cloud that is still to be found
 
 
 def make_plan(
-    session: Session, forced: Mapping[str, Action] | None = None, max_seconds: float | None = None
+    session: Session,
+    forced: Mapping[str, Action] | None = None,
+    max_seconds: float | None = None,
+    geometry: GeometryConfig | None = None,
 ) -> Plan:
-    """Looks at a session and decides; nothing is written, and only a few frames are read.
+    """Looks at a session and decides; nothing is written, and only a few frames are looked into.
 
     Args:
         session: What is to be fitted.
         forced: Decisions to turn round.
         max_seconds: Time that the fit may take; unlit frames are left out until it should do.
+        geometry: How poses, cloud and masks are found where they are not given.
 
     Raises:
         SessionError: A part of the session cannot be read.
     """
     forced = forced or {}
-    poses = session.load_scene_cameras() if session.cameras_dir.is_dir() else {}
-    cloud = read_ply(session.points_path) if session.points_path.is_file() else None
+    cache = StageCache(session)
+    poses = session.load_scene_cameras() if cache.is_whole("poses") else {}
+    cloud = read_ply(session.points_path) if cache.is_whole("cloud") else None
+    found = plan_geometry(session, cache, geometry or GeometryConfig(), poses, cloud, forced)
+    if found.poses.action is Action.RUN:
+        poses = {}  # what lies there is out of date
+    if found.cloud.action is Action.RUN:
+        cloud = None
     fitted, left_out = _select(session.frames, poses)
 
     narrowing = []
@@ -75,18 +89,19 @@ def make_plan(
         decisions=(
             _frames(session.frames, fitted, left_out),
             _flash(session.frames, fitted),
-            _poses(session.frames, poses),
+            found.poses,
+            found.cloud,
+            found.masks,
+            found.scale,
             views,
             _undistortion(poses, forced),
-            _cloud(cloud),
             _normals(cloud),
-            _masks(session, fitted),
             room,
             time,
         ),
         frames=tuple(record.index for record in fitted),
         left_out=dict(sorted(left_out.items())),
-        estimated_s=_estimated_s(fitted, cloud),
+        estimated_s=found.estimated_s + _estimated_s(fitted, cloud),
     )
 
 
@@ -140,20 +155,6 @@ def _flash(frames: list[FrameRecord], fitted: list[FrameRecord]) -> Decision:
     return Decision("flash", Action.GIVEN, seen)
 
 
-def _poses(frames: list[FrameRecord], poses: Mapping[int, Camera]) -> Decision:
-    if not poses:
-        return Decision(
-            "poses",
-            Action.REFUSE,
-            "the session has no camera poses; import with `--poses cameras.json` or from a COLMAP model "
-            "(finding them by structure from motion is still to come)",
-        )
-    kept = sum(record.usable for record in frames)
-    return Decision(
-        "poses", Action.GIVEN, f"poses of {len(poses)} frames ({kept} usable)", "structure from motion"
-    )
-
-
 def _redundant_views(
     fitted: list[FrameRecord],
     poses: Mapping[int, Camera],
@@ -187,30 +188,11 @@ def _undistortion(poses: Mapping[int, Camera], forced: Mapping[str, Action]) -> 
     return Decision(name, action, moved, "resampling every frame" if action is Action.SKIP else "")
 
 
-def _cloud(cloud: PointCloud | None) -> Decision:
-    if cloud is None:
-        return Decision(
-            "cloud",
-            Action.REFUSE,
-            "the session has no point cloud; import with `--points points.ply` "
-            "(making one by dense stereo is still to come)",
-        )
-    return Decision("cloud", Action.GIVEN, f"{len(cloud.points):,} points", "dense stereo")
-
-
 def _normals(cloud: PointCloud | None) -> Decision:
     seen = "from each point's neighbours, refined by the flash"
     if cloud is not None and cloud.normals is not None:
         seen += "; the cloud's own say which side is out"
     return Decision("normals", Action.RUN, seen)
-
-
-def _masks(session: Session, fitted: list[FrameRecord]) -> Decision:
-    masked = sum(session.mask_path(record.index).is_file() for record in fitted)
-    if masked:
-        seen = f"masks of {masked} of {len(fitted)} frames clean the cloud"
-        return Decision("masks", Action.GIVEN, seen, "segmentation")
-    return Decision("masks", Action.SKIP, "none given: every point of the cloud is taken for the head")
 
 
 def _room_shading(fitted: list[FrameRecord], session: Session, forced: Mapping[str, Action]) -> Narrowing:
@@ -273,5 +255,5 @@ def _evenly(records: list[FrameRecord], count: int) -> list[FrameRecord]:
 
 
 def _estimated_s(fitted: list[FrameRecord], cloud: PointCloud | None) -> float:
-    points = 0 if cloud is None else len(cloud.points)
+    points = _POINTS_FOUND if cloud is None else len(cloud.points)
     return _SECONDS + _SECONDS_PER_POINT * points + _SECONDS_PER_FRAME * len(fitted)

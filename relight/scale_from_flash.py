@@ -7,8 +7,8 @@ nothing, with one 1.5 cm off hardly anything, with one 10 cm off a few per cent.
 
 Per candidate scale the flash's part of the frames is fitted with one albedo a point and one gain a frame, and
 the robust misfit compared. The uncertainty comes from leaving out frames one block after the other: normals
-and shadows err alike in neighbouring points, which the misfit's curvature alone does not know. What errs alike
-in all frames is added to it.
+and shadows err alike in neighbouring points, which the misfit's curvature does not know. What errs alike in
+all frames is added to it.
 """
 
 from __future__ import annotations
@@ -59,6 +59,19 @@ class FlashSamples:
     normals: NDArray[np.float64]
     centres_world: NDArray[np.float64]
     world_from_cam: NDArray[np.float64]
+
+    @property
+    def albedo(self) -> NDArray[np.float64]:
+        """[P] up to one factor: Lambert's, with the flash at the lens; 0 where no frame shows the point."""
+        towards = self.centres_world[:, None] - self.points
+        square = (towards * towards).sum(axis=-1)
+        cosine = (towards * self.normals).sum(axis=-1) / np.sqrt(np.maximum(square, 1e-30))
+        weight = self.weight * (cosine > _LEAST_COSINE)
+        model = np.maximum(cosine, 0.0) / np.maximum(square, 1e-30)
+        found: NDArray[np.float64] = (weight * model * self.radiance).sum(axis=0) / np.maximum(
+            (weight * model**2).sum(axis=0), 1e-30
+        )
+        return np.maximum(found, 0.0)
 
 
 @dataclass(frozen=True)

@@ -5,8 +5,12 @@ from __future__ import annotations
 import argparse
 import math
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from relight.errors import PortraitError
+
+if TYPE_CHECKING:
+    from relight.geometry_plan import GeometryConfig
 
 
 def add_session(parser: argparse.ArgumentParser) -> None:
@@ -33,8 +37,36 @@ def add_forced(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="NAME=run|skip",
-        help="turn a decision of the plan round: undistortion, redundant_views or room_shading",
+        help="turn a decision of the plan round: undistortion, redundant_views, room_shading or masks",
     )
+
+
+def add_geometry(parser: argparse.ArgumentParser) -> None:
+    """What helps to find poses, cloud and masks where the session does not bring them."""
+    group = parser.add_argument_group("for poses, cloud and masks that are not given")
+    group.add_argument(
+        "--marker-side",
+        type=positive_number,
+        metavar="METRES",
+        help="side of the printed ArUco markers about the head: gives the scene its unit of length",
+    )
+    group.add_argument(
+        "--u2net",
+        type=Path,
+        metavar="FILE",
+        help="weights of U2-Net as published (u2net.pth), to help with the masks; without, none are needed",
+    )
+
+
+def chosen_geometry(args: argparse.Namespace) -> GeometryConfig:
+    """The settings that the flags of `add_geometry` ask for."""
+    from relight.geometry_plan import GeometryConfig
+    from relight.masks import MaskConfig
+    from relight.sfm import SfmConfig
+
+    sfm = SfmConfig() if args.marker_side is None else SfmConfig(marker_side_m=args.marker_side)
+    masks = MaskConfig() if args.u2net is None else MaskConfig(u2net=str(args.u2net))
+    return GeometryConfig(sfm=sfm, masks=masks)
 
 
 def add_max_seconds(parser: argparse.ArgumentParser) -> None:

@@ -37,6 +37,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--seed", type=int, default=0, metavar="N", help="another head in another room (default 0)"
     )
     parser.add_argument("--quick", action="store_true", help="a coarse head in small pictures, in seconds")
+    parser.add_argument(
+        "--frames-only",
+        action="store_true",
+        help="withhold the rig's poses and cloud: find them, and masks, from the film alone (takes minutes)",
+    )
     add_device(parser)
 
 
@@ -58,7 +63,9 @@ def run(args: argparse.Namespace) -> None:
         config = replace(config, path=replace(config.path, duration_s=_FILM_S))
     with StageProgress() as progress:
         video = simulate_video(filmed, config, progress)
-        options = ImportOptions(poses=filmed / "cameras.json", points=filmed / "points.ply")
+        options = ImportOptions()
+        if not args.frames_only:
+            options = ImportOptions(poses=filmed / "cameras.json", points=filmed / "points.ply")
         imported = import_source([video], session, options, progress)
         portrait = fit(session, device=args.device, progress=progress)
         table = evaluate_portrait(session, filmed, portrait.name, progress=progress)

@@ -8,7 +8,13 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from relight.commands.arguments import add_forced, add_max_seconds, add_session
+from relight.commands.arguments import (
+    add_forced,
+    add_geometry,
+    add_max_seconds,
+    add_session,
+    chosen_geometry,
+)
 
 if TYPE_CHECKING:
     from relight.plan import Plan
@@ -21,6 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_session(parser)
     add_forced(parser)
     add_max_seconds(parser)
+    add_geometry(parser)
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the plan as JSON too")
 
 
@@ -31,7 +38,9 @@ def run(args: argparse.Namespace) -> None:
     from relight.plan import parse_forced
     from relight.planning import make_plan
 
-    plan = make_plan(Session.open(args.session), parse_forced(args.force), args.max_seconds)
+    plan = make_plan(
+        Session.open(args.session), parse_forced(args.force), args.max_seconds, chosen_geometry(args)
+    )
     print_plan(plan)
     if args.json:
         atomic_write(args.json, (json.dumps(plan.as_json(), indent=2) + "\n").encode())
@@ -50,4 +59,10 @@ def print_plan(plan: Plan) -> None:
         action = f"{decision.action.value} (forced)" if decision.forced else decision.action.value
         table.add_row(decision.name, action, decision.reason, decision.saving)
     # In a file or a pipe no terminal sets the width: the reasons should not be cut to 80 columns.
-    Console(width=None if sys.stdout.isatty() else 140).print(table)
+    console = Console(width=None if sys.stdout.isatty() else 140)
+    console.print(table)
+    console.print(f"\nabout {_duration(plan.estimated_s)} on two cores")
+
+
+def _duration(seconds: float) -> str:
+    return f"{seconds:.0f} s" if seconds < 90 else f"{seconds / 60:.0f} minutes"

@@ -39,5 +39,26 @@ def describe_session(session: Session) -> str:
     return "\n".join(lines)
 
 
+def describe_geometry(session: Session) -> list[str]:
+    """What was found from the frames, a line each; nothing where all was given."""
+    from relight.stage_cache import StageCache
+
+    cache = StageCache(session)
+    lines = []
+    for stage, record in ((stage, cache.record(stage)) for stage in ("poses", "cloud", "masks", "scale")):
+        if record is None:
+            continue
+        facts = ", ".join(
+            f"{name.replace('_', ' ')} {value:.4g}"
+            if isinstance(value, float)
+            else f"{name.replace('_', ' ')} {value}"
+            for name, value in record.report.items()
+            if isinstance(value, (int, float, str)) and not isinstance(value, bool)
+        )
+        lines.append(f"{stage:<9} {facts}")
+        lines += [f"note      {sentence}" for sentence in record.warnings]
+    return lines
+
+
 def _word(path: Path) -> str:
     return "yes" if path.exists() else "no"
