@@ -1,0 +1,24 @@
+"""Errors of calibrating, under `capture.errors.CalibrationError`.
+
+CalibrationError
+├── BoardError       a board cannot be made, printed, or read from its description
+├── IntrinsicsError  pictures of a board do not tell a camera's geometry
+└── LensFileError    a file of another tool with intrinsics cannot be read, or cannot hold ours
+
+Every message is one sentence for the user: what is wrong, with its name, value and limit, and what to do
+next.
+"""
+
+from capture.errors import CalibrationError
+
+
+class BoardError(CalibrationError):
+    """A board cannot be made, printed, or read from its description."""
+
+
+class IntrinsicsError(CalibrationError):
+    """Pictures of a board do not tell a camera's geometry."""
+
+
+class LensFileError(CalibrationError):
+    """A file with intrinsics of another tool cannot be read, or cannot hold what is to be written."""
