@@ -1,16 +1,15 @@
 """Which of a series of stills the flash lit: jumps of light against the neighbours, in linear light.
 
 Stills have no rows' times and no rhythm: every fifth may be lit, or pairs, or any. Between neighbours the
-hand has moved a little and the room's level drifts, but a flash that goes on or off moves the light by the
-same amount every time, and the near head by more than the far background. So a picture is three numbers, the
-log light of a centre disc, of the ring around it and of the corners, and
+hand has moved and the room's level drifts, but a flash that goes on or off moves the light by the same amount
+every time, and the near head by more than the far background. So the step of light from one picture to the
+next is three numbers, of a centre disc, of the ring around it and of the corners (`still_steps`), and
 
-    f_k = b_k + s_k g + noise,      s_k in {0, 1},
+    f_k - f_j = (s_k - s_j) g + noise,      s in {0, 1},    |k - j| <= REACH.
 
-with a level b that is unknown but the same, up to a drift, in pictures that are few apart. The labels are
-found exactly over all pairs up to `_REACH` apart: a hidden Markov model whose state is the last labels. Gain
-and noise are found in turn with them, and the three numbers are weighed as Fisher's discriminant does, which
-makes the split blind to exposure where exposure wanders and lets it use the level where it is steady.
+The labels s are found exactly over all these pairs (`still_labels`). Gain and noise are found in turn with
+them, and the three numbers are weighed as Fisher's discriminant does, which makes the split blind to exposure
+where exposure wanders and lets it use the level where it is steady.
 
 No label is given in doubt: a wrong 1 or 0 costs the fit more than a picture that is left out.
 """
@@ -21,28 +20,23 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from capture.errors import TaggingError
 from capture.tagging.config import TaggingConfig
 from capture.tagging.profiles import FrameProfiles
 from capture.tagging.result import FrameTag
-
-Floats = NDArray[np.float64]
-Labels = NDArray[np.bool_]
+from capture.tagging.still_labels import Floats, Labels, Steps, likeliest_labels, lit_probability
+from capture.tagging.still_steps import LIGHT_REGIONS, REACH, THIRDS, disc_radiance, light_steps
 
 _LEAST_STILLS = 8
-_REACH = 4  # pictures: further apart the hand has moved too far for a comparison
-# Radii of the centre disc and of the corners, 1 = half the picture's sides.
-_DISC, _CORNERS = 0.5, 1.0
 # Gains tried first, in log light: from half of what is credible to more than any phone's lamp gives.
 _FIRST_GAINS = np.geomspace(0.03, 3.2, 16)
 _FIRST_WEIGHTS = np.array([[1.0, 0.0, 0.0], [1.0, 0.0, -1.0], [1.0, -0.5, -0.5]])
+_DARKEST_OF = 4  # pictures before and after
 _FIRST_SPREAD = 1 / 6  # of the noise, in gains
 _ROUNDS, _STARTS = 12, 4
-_TAIL = 3.0  # degrees of freedom of the residuals (Student)
 _SHRINKAGE = 0.3  # of the noise's covariance towards its diagonal: few pictures know it badly
-# The flash's gain changes with where it comes from; from picture to picture by about so much of itself.
-_GAIN_SPREAD = 0.12
 _LEAST_SPREAD = 0.01  # of the noise, in gains; steadier than that is chance
 # Scores up to the first are unlit, from the second on lit; between them lit in part, or not known.
 _UNLIT, _LIT = 0.25, 0.65
@@ -92,8 +86,9 @@ def tag_stills(profiles: FrameProfiles, config: TaggingConfig | None = None) -> 
             f"The flash of {len(seen)} picture{'s' * (len(seen) != 1)} cannot be told: at least "
             f"{_LEAST_STILLS} are needed, lit and unlit ones; name the lit ones in a flash list."
         )
-    light = np.stack([profiles.linear(int(k)) for k in seen]).astype(np.float64)
-    model = _fit(_region_levels(light))
+    light = np.stack([profiles.linear(int(k)) for k in seen])
+    steps = light_steps(light)
+    model = _fit([step[:, LIGHT_REGIONS] for step in steps], disc_radiance(light))
     if model is None:
         raise TaggingError(
             f"No flash that goes on and off can be told from the light of the {len(seen)} pictures: it lit "
@@ -106,7 +101,7 @@ def tag_stills(profiles: FrameProfiles, config: TaggingConfig | None = None) -> 
             f"{config.min_separation:g} needed; gain {100 * np.expm1(model.gain[0]):.0f} %): the flash lit "
             "all of them or none, or it is too weak for the room; name the lit ones in a flash list."
         )
-    tags = _tags(profiles, seen, model, _is_patchy(light, model.lit), config)
+    tags = _tags(profiles, seen, model, _is_patchy(steps, model.lit), config)
     unknown = sum(tag.flash is None for tag in tags)
     if unknown > _MOST_UNKNOWN * len(tags) or {0, 1} - {tag.flash for tag in tags}:
         raise TaggingError(
@@ -129,50 +124,62 @@ class _Model:
 
     Attributes:
         lit: [K] bool.
-        level: [K] the discriminant, in gains: a flash adds 1.
+        steps: for each distance m, [K - m] the discriminant's, in gains: a flash adds 1.
         gain: [3] log gain of disc, ring and corners.
-        spread: [_REACH] of the level between pictures of one kind, by their distance.
+        spread: [REACH] of the steps between pictures of one kind, by their distance.
         separation: the gain in spreads of the noise between neighbours, tails counted.
         lit_radiance: of the disc in a typical lit picture.
     """
 
     lit: Labels
-    level: Floats
+    steps: Steps
     gain: Floats
     spread: Floats
     separation: float
     lit_radiance: float
 
 
-def _region_levels(light: Floats) -> Floats:
-    """[K, 3] log mean light of centre disc, ring and corners."""
-    rows, columns = light.shape[1:]
-    y = ((np.arange(rows) + 0.5) / rows * 2 - 1)[:, None]
-    x = ((np.arange(columns) + 0.5) / columns * 2 - 1)[None, :]
-    radius = np.hypot(x, y)
-    regions = (radius < _DISC, (radius >= _DISC) & (radius < _CORNERS), radius >= _CORNERS)
-    return np.log(np.stack([light[:, region].mean(axis=1) for region in regions], axis=1))
+def _fit(steps: Steps, radiance: Floats) -> _Model | None:
+    """The best credible model over several first guesses; None = there is none.
 
-
-def _fit(features: Floats) -> _Model | None:
-    """The best credible model over several first guesses; None = there is none."""
+    Args:
+        steps: for each distance m, [K - m, 3].
+        radiance: [K] of the disc.
+    """
     found: dict[bytes, _Model] = {}
     for weight in _FIRST_WEIGHTS:
-        level = features @ weight
         for gain in _FIRST_GAINS:
-            lit = _labels(level / gain, np.full(_REACH, _FIRST_SPREAD))
-            if lit.tobytes() not in found and (model := _learn(features, lit)) is not None:
+            even = _evened(steps, radiance, float(gain))
+            lit = likeliest_labels([step @ weight / gain for step in even], np.full(REACH, _FIRST_SPREAD))
+            if lit.tobytes() not in found and (model := _learn(even, radiance, lit)) is not None:
                 found[lit.tobytes()] = model
     starts = sorted(filter(_credible, found.values()), key=lambda model: -model.separation)
-    models = [_settled(features, start) for start in starts[:_STARTS]]
+    models = [_settled(steps, radiance, start) for start in starts[:_STARTS]]
     return max(filter(_credible, models), key=lambda model: model.separation, default=None)
 
 
-def _settled(features: Floats, model: _Model) -> _Model:
+def _evened(steps: Steps, radiance: Floats, gain: float) -> list[Floats]:
+    """The steps as if the room lit the head equally from everywhere.
+
+    The flash goes with the camera and adds about the same light c to each picture; the room's light r on what
+    the camera sees may be a third of it on the dark side of the head, where the gain log(1 + c / r) is larger.
+    The darkest of some pictures in a row is taken to be unlit.
+    """
+    room = ndimage.minimum_filter1d(np.maximum(radiance, 1e-4), 2 * _DARKEST_OF + 1, mode="nearest")
+    room = ndimage.uniform_filter1d(room, 2 * _DARKEST_OF + 1, mode="nearest")
+    usual = float(np.median(room))
+    share = np.log1p(np.expm1(max(gain, 1e-3)) * usual / room) / max(gain, 1e-3)
+    return [
+        step / np.sqrt(share[apart:] * share[:-apart])[:, None] for apart, step in enumerate(steps, start=1)
+    ]
+
+
+def _settled(steps: Steps, radiance: Floats, model: _Model) -> _Model:
     """Labels and model found in turn until the labels stay."""
     for _ in range(_ROUNDS):
-        lit = _labels(model.level, model.spread)
-        if np.array_equal(lit, model.lit) or (again := _learn(features, lit)) is None:
+        lit = likeliest_labels(model.steps, model.spread)
+        even = _evened(steps, radiance, float(model.gain[0]))
+        if np.array_equal(lit, model.lit) or (again := _learn(even, radiance, lit)) is None:
             break
         model = again
     return model
@@ -189,11 +196,11 @@ def _credible(model: _Model) -> bool:
     return bool(changes >= _LEAST_CHANGES and near > _LEAST_LOG_GAIN and nearer)
 
 
-def _learn(features: Floats, lit: Labels) -> _Model | None:
+def _learn(steps: Steps, radiance: Floats, lit: Labels) -> _Model | None:
     """Gain, discriminant and noise of labels; None where the two kinds are never near each other."""
     rises, stays = [], []
-    for apart in range(1, _REACH + 1):
-        step, change = features[apart:] - features[:-apart], lit[apart:].astype(int) - lit[:-apart]
+    for apart, step in enumerate(steps, start=1):
+        change = lit[apart:].astype(int) - lit[:-apart]
         rises.append(step[change != 0] * change[change != 0, None])
         stays.append(step[change == 0])
     risen, near = np.concatenate(rises), np.concatenate(stays[:2])
@@ -211,11 +218,11 @@ def _learn(features: Floats, lit: Labels) -> _Model | None:
     worst = max(usual, float(np.quantile(np.abs(near @ weight), 0.97)) / 2.17)
     return _Model(
         lit=lit,
-        level=features @ weight,
+        steps=tuple(step @ weight for step in steps),
         gain=gain,
         spread=np.maximum(np.where(np.isnan(spread), usual, spread), _LEAST_SPREAD),
         separation=float(np.sqrt(2.0) / max(worst, 1e-6)),
-        lit_radiance=float(np.exp(np.median(features[lit, 0]))),
+        lit_radiance=float(np.median(radiance[lit])),
     )
 
 
@@ -234,109 +241,42 @@ def _spread(values: Floats) -> float:
     return float(1.4826 * np.median(np.abs(values))) if len(values) else np.nan
 
 
-def _pair_costs(level: Floats, spread: Floats) -> Floats:
-    """[K, _REACH, 2, 2] cost of the labels (earlier, later) of each picture and the one so many before it.
-
-    The pairs of a picture are not independent; each counts for one part in `_REACH`.
-    """
-    cost = np.zeros((len(level), _REACH, 2, 2))
-    for apart in range(1, min(_REACH, len(level) - 1) + 1):
-        step = level[apart:] - level[:-apart]
-        for earlier in (0, 1):
-            for later in (0, 1):
-                variance = spread[apart - 1] ** 2 + _GAIN_SPREAD**2 * max(earlier, later)
-                square = (step - (later - earlier)) ** 2 / variance
-                student = 0.5 * (_TAIL + 1) * np.log1p(square / _TAIL) + 0.5 * np.log(variance)
-                cost[apart:, apart - 1, earlier, later] = student / _REACH
-    return cost
-
-
-def _state_costs(level: Floats, spread: Floats) -> Floats:
-    """[K, S] cost of each picture in each state; a state's bit m is the label of the picture m before."""
-    pairs = _pair_costs(level, spread)
-    states = np.arange(2 ** (_REACH + 1))
-    label = (states[:, None] >> np.arange(_REACH + 1)) & 1
-    total = np.zeros((len(level), len(states)))
-    for apart in range(1, _REACH + 1):
-        total += pairs[:, apart - 1][:, label[:, apart], label[:, 0]]
-    return total
-
-
-def _labels(level: Floats, spread: Floats) -> Labels:
-    """[K] the labels of least cost (Viterbi 1967)."""
-    costs = _state_costs(level, spread)
-    count = costs.shape[1]
-    before = np.arange(count) >> 1  # the state one picture earlier, but for its oldest label
-    oldest = count // 2
-    best, choice = costs[0], np.zeros(costs.shape, bool)
-    for k in range(1, len(costs)):
-        either = np.stack([best[before], best[before + oldest]])
-        choice[k] = either[1] < either[0]
-        best = either.min(axis=0) + costs[k]
-    state = int(np.argmin(best))
-    lit = np.zeros(len(costs), bool)
-    for k in range(len(costs) - 1, -1, -1):
-        lit[k] = state & 1
-        state = (state >> 1) + (oldest if choice[k, state] else 0)
-    return lit
-
-
-def _posterior(model: _Model) -> Floats:
-    """[K] probability that each picture is lit (forward and backward, Rabiner 1989)."""
-    costs = _state_costs(model.level, model.spread)
-    count = costs.shape[1]
-    before, oldest = np.arange(count) >> 1, count // 2
-    forward, backward = np.zeros(costs.shape), np.zeros(costs.shape)
-    forward[0] = -costs[0]
-    for k in range(1, len(costs)):
-        reached = np.logaddexp(forward[k - 1][before], forward[k - 1][before + oldest]) - costs[k]
-        forward[k] = reached - reached.max()
-    after = (np.arange(count) << 1) & (count - 1)  # the states one picture later
-    for k in range(len(costs) - 2, -1, -1):
-        arriving = backward[k + 1] - costs[k + 1]
-        reached = np.logaddexp(arriving[after], arriving[after + 1])
-        backward[k] = reached - reached.max()
-    total = forward + backward
-    total = np.exp(total - total.max(axis=1, keepdims=True))
-    odd = (np.arange(count) & 1).astype(bool)
-    return np.asarray(total[:, odd].sum(axis=1) / total.sum(axis=1))
-
-
 def _scores(model: _Model) -> Floats:
-    """[K] each picture's level over what its neighbours would be unlit: 0 = unlit, 1 = lit.
+    """[K] each picture's light over what it would be unlit, in gains: 0 = unlit, 1 = lit.
 
     Between neighbours on both sides a straight drift cancels.
     """
-    reduced = model.level - model.lit
-    return np.asarray(model.level - _around(reduced, model.spread))
+    return _over_unlit(model.steps, model.lit.astype(float), model.spread)
 
 
-def _around(values: Floats, spread: Floats) -> Floats:
-    """[K, ...] weighted mean of the values up to `_REACH` pictures before and after each."""
-    total = np.zeros_like(values)
-    weights = np.zeros(len(values))
-    for apart in range(1, min(_REACH, len(values) - 1) + 1):
+def _over_unlit(steps: Steps, offset: Floats, spread: Floats) -> Floats:
+    """[K, ...] weighted mean over the neighbours of the step from them, and what they are over unlit.
+
+    Args:
+        steps: for each distance m, [K - m, ...].
+        offset: [K, ...] what each picture is over unlit.
+        spread: [REACH] of the steps.
+    """
+    total = np.zeros_like(offset)
+    weights = np.zeros(len(offset))
+    for apart, step in enumerate(steps, start=1):
         weight = 1.0 / spread[apart - 1] ** 2
-        for target, other in (
-            (slice(apart, None), slice(None, -apart)),
-            (slice(None, -apart), slice(apart, None)),
-        ):
-            total[target] += weight * values[other]
-            weights[target] += weight
-    return np.asarray(total / weights.reshape(-1, *[1] * (values.ndim - 1)))
+        total[apart:] += weight * (step + offset[:-apart])
+        total[:-apart] += weight * (offset[apart:] - step)
+        weights[apart:] += weight
+        weights[:-apart] += weight
+    return np.asarray(total / weights.reshape(-1, *[1] * (offset.ndim - 1)))
 
 
-def _is_patchy(light: Floats, lit: Labels) -> Labels:
+def _is_patchy(steps: Steps, lit: Labels) -> Labels:
     """[K] whether a third of the rows, in the middle columns, is not lit as the rest is.
 
     So a rolling shutter shows a pulse that began or ended while its rows were read.
     """
-    columns = light.shape[2]
-    middle = light[:, :, columns // 4 : columns - columns // 4]
-    thirds = np.log(np.stack([part.mean(axis=(1, 2)) for part in np.array_split(middle, 3, axis=1)], axis=1))
-    gain, rise = np.zeros(3), thirds
+    thirds = [step[:, THIRDS] for step in steps]
+    gain, rise = np.zeros(3), np.zeros((len(lit), 3))
     for _ in range(3):  # the gain of the thirds and the level around each picture, in turn
-        rise = thirds - _around(thirds - lit[:, None] * gain, np.ones(_REACH))
+        rise = _over_unlit(thirds, lit[:, None] * gain, np.ones(len(steps)))
         gain = np.median(rise[lit], axis=0)
     clear = gain > _CLEAR * np.array([_spread(column) for column in rise[~lit].T])
     share = rise / np.maximum(gain, 1e-6)
@@ -350,7 +290,8 @@ def _tags(
     """Tags of all pictures, with what is to be said besides the flash."""
     tags = [FrameTag(None, None, 0.0, ("unreadable",))] * len(profiles)
     clipped = profiles.clipped()
-    for k, score, posterior, part in zip(seen, _scores(model), _posterior(model), patchy, strict=True):
+    probability = lit_probability(model.steps, model.spread)
+    for k, score, posterior, part in zip(seen, _scores(model), probability, patchy, strict=True):
         tag = _tag(float(score), float(posterior), bool(part))
         remarks = ["clipped"] if clipped[k] > config.clipped_share else []
         remarks += ["clipped_frame"] if clipped[k] > config.hopeless_share else []
