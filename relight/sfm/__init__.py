@@ -1,6 +1,6 @@
-"""Poses from a session's frames alone: structure from motion with COLMAP, on pictures that the flash leaves alike."""
+"""Poses from a session's frames alone: structure from motion on pictures that the flash leaves alike."""
 
-import numpy  # noqa: F401, ICN001  before pycolmap, whose own zlib breaks the writing of PNG when it is first
+import numpy  # noqa: F401  before pycolmap, whose own zlib breaks the writing of PNG when it is first
 
 from relight.sfm.config import PoseResult, SfmConfig
 from relight.sfm.find import find_poses

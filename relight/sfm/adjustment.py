@@ -1,4 +1,4 @@
-"""The last adjustment of a reconstruction: robust, without outliers, with the lens model that the data support."""
+"""The last adjustment of a reconstruction: robust, and with the lens model that the data support."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def choose_lens(
 ) -> tuple[pycolmap.Reconstruction, list[LensTrial]]:
     """The reconstruction with the simplest lens model that explains it, and what was tried.
 
-    From one focal length alone to OpenCV's four distortion terms; a term is kept when it lowers the error by
+    From one focal length alone to two radial terms; a term is kept when it lowers the error by
     more than a percent and moves what is seen by a fifth of a pixel. The principal point stays in the middle:
     on a half circle it trades against the poses.
     """
@@ -66,6 +66,8 @@ def choose_lens(
     trials = [("SIMPLE_PINHOLE", best_error)]
     chosen = 0
     for name in ("SIMPLE_RADIAL", "RADIAL"):
+        if len(trials) > chosen + 1:
+            break  # one term did not help; two will not
         candidate, error = _with_lens(model, name, threads)
         trials.append((name, error))
         shift = max(edge_shift_px(camera) for camera in candidate.cameras.values())

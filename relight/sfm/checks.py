@@ -185,30 +185,6 @@ def path_jumps(sparse: Sparse) -> list[int]:
     return found
 
 
-def tracked_shares(
-    sparse: Sparse, looks: Sequence[Look], pairs: Sequence[Pair], subject: Sequence[NDArray[np.bool_]]
-) -> tuple[float, float, int, int]:
-    """How much of what matches ended up in the reconstruction, on the subject and off it.
-
-    Returns:
-        Share of the matches whose two ends are one point, on the subject and on the background; and the
-        numbers of matches on each.
-    """
-    points = {i: sparse.point_of_feature(i, len(looks[i].features)) for i in sparse.cameras}
-    kept, total = [0, 0], [0, 0]
-    for pair in pairs:
-        i, j = pair.first, pair.second
-        if i not in points or j not in points or not len(pair.matches):
-            continue
-        a, b = pair.matches[:, 0], pair.matches[:, 1]
-        one = (points[i][a] >= 0) & (points[i][a] == points[j][b])
-        for side, flag in enumerate((subject[i][a] & subject[j][b], ~subject[i][a] & ~subject[j][b])):
-            kept[side] += int((one & flag).sum())
-            total[side] += int(flag.sum())
-    on, off = (k / t if t else 0.0 for k, t in zip(kept, total, strict=True))
-    return on, off, total[0], total[1]
-
-
 def _normalised(sparse: Sparse, look: Look, position: int) -> Floats:
     """[N, 2] features of a frame as x/z, y/z without distortion."""
     camera = sparse.cameras[position]

@@ -20,8 +20,8 @@ class SfmConfig:
     Attributes:
         max_side_px: Frames are looked at with their longer side no longer than this.
         max_features: A frame's most features.
-        background: "static" = it stands still with the head, "ignore" = use only what the flash lights (or the
-            session's masks), "auto" = find out.
+        background: "static" = it stands still with the head, "ignore" = use only what the flash lights (or
+            the session's masks), "auto" = find out.
         marker_side_m: Side of printed ArUco or AprilTag markers, metres, when there are any; gives the unit.
         board: ChArUco board as "COLUMNSxROWS:SQUARE_M:MARKER_M:DICTIONARY", e.g.
             "7x10:0.025:0.018:DICT_5X5_250"; gives the unit.
@@ -59,9 +59,9 @@ class SfmConfig:
 class PoseResult:
     """Poses of a session's frames, in a world of their own.
 
-    The world has +Y up (the mean of the cameras' up), its origin where the cameras look, and +Z level towards
-    the middle of their path. Its unit is the metre when `metric`; else the median distance from the cameras to
-    the origin is `relight.sfm.world.TYPICAL_DISTANCE`.
+    The world has +Y up (the mean of the cameras' up), its origin where the cameras look, and +Z level
+    towards the middle of their path. Its unit is the metre when `metric`; else the median distance from the
+    cameras to the origin is `relight.sfm.world.TYPICAL_DISTANCE`.
 
     Attributes:
         cameras: By frame index, at the frames' full size, with distortion where one was found.

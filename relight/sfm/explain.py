@@ -13,6 +13,7 @@ from relight.sfm.survey import Look
 
 _FEW_FEATURES = 150
 _FEW_MATCHES = 30
+_MOSTLY = 0.8
 _NO_MOTION = 0.02  # of the longer side, between the frames that are farthest apart and still match
 
 _KINDS = pycolmap.TwoViewGeometryConfiguration
@@ -50,6 +51,13 @@ def explain(looks: Sequence[Look], outcomes: Sequence[Outcome], mapped: Sequence
     )
 
 
+def all_flat(pairs: Sequence[Pair]) -> bool:
+    """Whether the frames match well and yet show no parallax: other features would not change that."""
+    verified = [pair for pair in pairs if pair.verified]
+    flat = [pair for pair in verified if pair.geometry is not None and pair.geometry.config in _FLAT]
+    return len(verified) >= max(3, len(pairs) // 4) and len(flat) > _MOSTLY * len(verified)
+
+
 def _seen(looks: Sequence[Look], pairs: Sequence[Pair]) -> tuple[list[str], list[str]]:
     """What the features and matches alone show, and what would change it."""
     seen, advice = [], []
@@ -66,9 +74,7 @@ def _seen(looks: Sequence[Look], pairs: Sequence[Pair]) -> tuple[list[str], list
     if motion is not None and motion < _NO_MOTION:
         seen.append(f"nothing moves by more than {100 * motion:.1f} % of the picture between any two frames")
         advice = ["walk around the head while filming"]
-    verified = [pair for pair in pairs if pair.verified and pair.geometry is not None]
-    flat = [pair for pair in verified if pair.geometry.config in _FLAT]
-    if len(verified) >= 3 and len(flat) > 0.8 * len(verified):
+    if all_flat(pairs):
         seen.append(
             "all motion is that of a plane or of a camera that turned on the spot: there is no parallax"
         )

@@ -70,7 +70,7 @@ def detect_features(
     if not usable.all():
         kernel = np.ones((2 * _ERODE_PX + 1, 2 * _ERODE_PX + 1), np.uint8)
         allowed = cv2.erode(usable.astype(np.uint8), kernel)
-    sift = cv2.SIFT_create(
+    sift = cv2.SIFT.create(
         nfeatures=recipe.max_features,
         contrastThreshold=recipe.contrast,
         edgeThreshold=_EDGE_RATIO,

@@ -19,16 +19,15 @@ from capture.frame_record import FrameRecord
 from capture.session import Session
 from relight.errors import GeometryError
 from relight.sfm.attempts import Outcome, attempt, match_pairs, verify_pairs
-from relight.sfm.checks import tracked_shares
 from relight.sfm.config import PoseResult, SfmConfig
 from relight.sfm.exif import focal_length_px
-from relight.sfm.explain import explain
+from relight.sfm.explain import all_flat, explain
 from relight.sfm.features import Recipe
 from relight.sfm.lenses import Lens, colmap_camera, starting_lens
 from relight.sfm.mapping import LEAST_FRAMES
 from relight.sfm.markers import Board, MarkerFinder
 from relight.sfm.matching import Pair
-from relight.sfm.motions import still_features
+from relight.sfm.motions import still_features, tracked_shares
 from relight.sfm.pairs import choose_pairs
 from relight.sfm.pictures import grey_radiance
 from relight.sfm.result import make_result
@@ -43,7 +42,7 @@ _STAGE = "poses"
 _ENOUGH = 0.9  # share of the keyframes with which no other way is tried
 _TRIED_FOR_MARKERS = 8  # frames
 _EXIF_BYTES = 1 << 17
-_LEAST_KEPT = 0.4  # of the background's share of tracked matches that the subject's must reach
+_LEAST_KEPT = 0.5  # of the background's share of tracked matches that the subject's must reach
 _LEAST_SUBJECT_MATCHES = 300
 
 
@@ -129,6 +128,8 @@ def find_poses(
         outcomes.append((way, outcome, about, warnings))
         logger.info("poses, %s: %d of %d frames", way.name, outcome.registered, len(search.kept))
         if outcome.usable and outcome.registered >= _ENOUGH * len(search.kept):
+            break
+        if not outcome.usable and all_flat(outcome.pairs):
             break
     usable = [entry for entry in outcomes if entry[1].usable]
     best = max(usable, key=lambda entry: entry[1].registered, default=None)
@@ -260,8 +261,8 @@ def _climb(search: _Search, way: _Way) -> tuple[Outcome, dict[str, Any], tuple[s
     if config.background == "ignore":
         if subject is None:
             raise GeometryError(
-                "The background is to be ignored, but neither masks nor the flash tell it from the head; give "
-                "masks, keep a metre between head and wall, or set the background to auto."
+                "The background is to be ignored, but neither masks nor the flash tell it from the head; "
+                "give masks, keep a metre between head and wall, or set the background to auto."
             )
         outcome, about = _solve(search, way, subject)
         return outcome, about | {"features_of": "subject"}, ()
@@ -277,7 +278,9 @@ def _climb(search: _Search, way: _Way) -> tuple[Outcome, dict[str, Any], tuple[s
     about |= {"features_of": "everything"}
     if subject is None or outcome.sparse is None:
         return outcome, about, ()
-    on, off, matches_on, matches_off = tracked_shares(outcome.sparse, mapped, outcome.pairs, subject)
+    on, off, matches_on, matches_off = tracked_shares(
+        outcome.sparse, mapped, outcome.pairs, subject, outcome.cameras, config.seed
+    )
     about |= {"tracked_on_subject": on, "tracked_off_subject": off, "matches_on_subject": matches_on}
     if matches_on < _LEAST_SUBJECT_MATCHES or matches_off < _LEAST_SUBJECT_MATCHES:
         return outcome, about, ()
@@ -290,8 +293,8 @@ def _climb(search: _Search, way: _Way) -> tuple[Outcome, dict[str, Any], tuple[s
         if on < _LEAST_KEPT * off:
             complaint = (
                 f"two motions: {100 * off:.0f} % of the matches on the background fit it, but only "
-                f"{100 * on:.0f} % of those on the head; the head moved against the room, and alone it has too "
-                "few features"
+                f"{100 * on:.0f} % of those on the head; the head moved against the room, and alone it has "
+                "too few features"
             )
             outcome = replace(outcome, complaints=(*outcome.complaints, complaint))
     if off < _LEAST_KEPT * on:

@@ -64,8 +64,8 @@ def starting_lens(
 def colmap_camera(lens: Lens, size: tuple[int, int], refine: bool, camera_id: int) -> pycolmap.Camera:
     """The COLMAP camera of a lens for frames looked at with another (width, height).
 
-    An unknown lens gets one focal length and one radial term: enough for phones, and what a walk around a head
-    determines well.
+    An unknown lens gets one focal length and one radial term: enough for phones, and what a walk around a
+    head determines well.
     """
     across, down = size[0] / lens.width, size[1] / lens.height
     fx, fy = lens.K[0, 0] * across, lens.K[1, 1] * down
@@ -103,7 +103,7 @@ def lens_of(camera: pycolmap.Camera, width: int, height: int) -> tuple[Floats, F
 
 
 def edge_shift_px(camera: pycolmap.Camera) -> float:
-    """How far distortion moves what a camera sees at the middles of its sides and its corners, mean, pixels."""
+    """Mean distance by which distortion moves the middles of the sides and the corners, pixels."""
     x = np.array([0.0, 0.5, 1.0, 0.5, 0.0, 1.0, 0.0, 1.0]) * camera.width
     y = np.array([0.5, 0.0, 0.5, 1.0, 0.0, 0.0, 1.0, 1.0]) * camera.height
     K = np.asarray(camera.calibration_matrix(), np.float64)

@@ -1,12 +1,15 @@
 """COLMAP's mapping, from features and pairs in memory to reconstructions in memory.
 
-The database that COLMAP wants lies in a temporary folder. Its incremental mapper gives the same result for the
-same seed; its global one does not and can be silently wrong, so that what it gives must be verified.
+The database that COLMAP wants lies in a temporary folder. Its incremental mapper gives the same result for
+the same seed; its global one does not and can be silently wrong, so that what it gives must be verified.
 """
 
 from __future__ import annotations
 
 import logging
+import os
+import subprocess
+import sys
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -22,6 +25,7 @@ logger = logging.getLogger(__name__)
 
 LEAST_FRAMES = 3
 _MOST_MODELS = 4  # further pieces than these are not worth their time
+_LONGEST_GLOBAL_S = 600.0
 
 
 @contextmanager
@@ -62,13 +66,42 @@ def map_frames(
         output = Path(folder) / "models"
         output.mkdir()
         if global_method:
-            found = pycolmap.global_mapping(path, folder, output, _global_options(threads, seed, refine_lens))
-        else:
+            return _largest_first(_map_globally(path, output, threads, seed, refine_lens))
+        for eased in (False, True):
             options = _incremental_options(len(looks), threads, seed, refine_lens)
+            if eased:  # a short arc has no two frames under a wide angle to start from
+                options.mapper.init_min_tri_angle = 4.0
+                options.mapper.init_min_num_inliers = 30
             found = pycolmap.incremental_mapping(path, folder, output, options)
-    models = [found[number] for number in sorted(found)]
-    models = [model for model in models if model.num_reg_images() >= LEAST_FRAMES]
-    return sorted(models, key=lambda model: -model.num_reg_images())
+            models = _largest_first([found[number] for number in sorted(found)])
+            if models:
+                return models
+    return []
+
+
+def _largest_first(models: Sequence[pycolmap.Reconstruction]) -> list[pycolmap.Reconstruction]:
+    whole = [model for model in models if model.num_reg_images() >= LEAST_FRAMES]
+    return sorted(whole, key=lambda model: -model.num_reg_images())
+
+
+def _map_globally(
+    database: Path, output: Path, threads: int, seed: int, refine_lens: bool
+) -> list[pycolmap.Reconstruction]:
+    """Global mapping in a process of its own: where COLMAP finds no start, it ends the process."""
+    command = [sys.executable, "-m", "relight.sfm.global_mapping", str(database), str(output)]
+    command += [str(threads), str(seed), str(int(refine_lens))]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
+    try:
+        ended = subprocess.run(
+            command, env=environment, capture_output=True, timeout=_LONGEST_GLOBAL_S, check=False
+        )
+    except subprocess.TimeoutExpired:
+        logger.warning("global mapping took longer than %g s and was stopped", _LONGEST_GLOBAL_S)
+        return []
+    if ended.returncode:
+        logger.info("global mapping ended with code %d", ended.returncode)
+        return []
+    return [pycolmap.Reconstruction(folder) for folder in sorted(output.iterdir()) if folder.is_dir()]
 
 
 def _write_database(
@@ -94,7 +127,7 @@ def _write_database(
                 database.write_frame(frame, use_frame_id=True)
                 database.write_keypoints(number, look.features.places_px.astype(np.float32))
             for pair in pairs:
-                if pair.verified:
+                if pair.geometry is not None and pair.verified:
                     numbers = (pair.first + 1, pair.second + 1)
                     database.write_matches(*numbers, pair.inliers)
                     database.write_two_view_geometry(*numbers, pair.geometry)
@@ -111,6 +144,7 @@ def _incremental_options(
     options.extract_colors = False
     options.min_model_size = min(10, max(LEAST_FRAMES, frames // 4))
     options.max_num_models = _MOST_MODELS
+    options.init_num_trials = 50
     options.ba_refine_focal_length = refine_lens
     options.ba_refine_extra_params = refine_lens
     options.ba_refine_principal_point = False
@@ -118,6 +152,8 @@ def _incremental_options(
     options.ba_global_frames_ratio = 1.3
     options.ba_global_points_ratio = 1.3
     options.ba_global_max_refinements = 2
+    options.ba_global_function_tolerance = 1e-5
+    options.ba_local_function_tolerance = 1e-4
     options.mapper.abs_pose_refine_focal_length = refine_lens
     options.mapper.abs_pose_refine_extra_params = refine_lens
     options.mapper.init_min_num_inliers = 50  # a head before a plain wall has no more
@@ -125,15 +161,4 @@ def _incremental_options(
     options.mapper.filter_max_reproj_error = 3.0
     options.mapper.random_seed = seed
     options.triangulation.random_seed = seed
-    return options
-
-
-def _global_options(threads: int, seed: int, refine_lens: bool) -> pycolmap.GlobalPipelineOptions:
-    options = pycolmap.GlobalPipelineOptions()
-    options.num_threads = threads
-    options.random_seed = seed
-    options.mapper.bundle_adjustment.refine_focal_length = refine_lens
-    options.mapper.bundle_adjustment.refine_extra_params = refine_lens
-    options.mapper.bundle_adjustment.ceres.use_gpu = False
-    options.mapper.global_positioning.use_gpu = False
     return options

@@ -184,7 +184,8 @@ def _markers(picture: NDArray[np.uint8], name: str) -> dict[int, NDArray[np.floa
     found, numbers, _ = cv2.aruco.ArucoDetector(_dictionary(name), parameters).detectMarkers(picture)
     seen: dict[int, NDArray[np.float64]] = {}
     twice = set()
-    for corners, number in zip(found, () if numbers is None else numbers.ravel().tolist(), strict=False):
+    listed = [] if numbers is None else [int(number) for number in np.asarray(numbers).ravel()]
+    for corners, number in zip(found, listed, strict=False):
         places = np.asarray(corners, np.float64).reshape(4, 2)
         sides = np.linalg.norm(places - np.roll(places, 1, axis=0), axis=1)
         if float(sides.min()) < _LEAST_SIDE_PX:

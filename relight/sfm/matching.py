@@ -16,6 +16,7 @@ RATIO = 0.8
 LEAST_INLIERS = 15
 """Fewer agree by chance."""
 
+_MOST_TRIALS = 1000  # 7 points without an outlier among half that are outliers
 _MAX_DISTANCE = 0.7  # of unit descriptors, as COLMAP
 
 
@@ -101,6 +102,7 @@ def verify(
     options.min_num_inliers = LEAST_INLIERS
     options.ransac.max_error = max_error_px
     options.ransac.random_seed = seed
+    options.ransac.max_num_trials = _MOST_TRIALS
     geometry = pycolmap.estimate_two_view_geometry(
         cameras[0], first.places_px, cameras[1], second.places_px, matches, options
     )

@@ -1,8 +1,8 @@
 """Which frames are worth comparing: neighbours along the capture path, and places that were passed again.
 
-Every comparison costs; all pairs of a hundred frames are five thousand. Neighbours at growing distances tie the
-path together, and a cheap descriptor of the whole frame, VLAD (Jégou et al. 2010) of its features, proposes
-frames that are far apart in time and see the same.
+Every comparison costs; all pairs of a hundred frames are five thousand. Neighbours at growing distances tie
+the path together, and a cheap descriptor of the whole frame, VLAD (Jégou et al. 2010) of its features,
+proposes frames that are far apart in time and see the same.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def choose_pairs(
 def global_likeness(descriptors: Sequence[NDArray[np.uint8]], seed: int) -> NDArray[np.float32]:
     """[F, F] cosine of the frames' VLADs; -1 for frames without features."""
     signatures = [_thinned(d, 600) for d in descriptors]
-    everything = np.concatenate(signatures).astype(np.float32) if signatures else np.zeros((0, 128))
+    everything = np.concatenate([*signatures, np.zeros((0, 128), np.uint8)]).astype(np.float32)
     if len(everything) < 2 * _WORDS:
         return np.full((len(descriptors), len(descriptors)), -1.0, np.float32)
     words = _vocabulary(everything, seed)

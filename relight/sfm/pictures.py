@@ -1,8 +1,8 @@
 """Pictures in which features are looked for: the same under flash and without it.
 
-What the flash changes in a picture is smooth, except at shadows: it multiplies the radiance by a slowly varying
-factor. In the logarithm of linear radiance that is an offset, which the local mean takes away; dividing by the
-local contrast brings skin, whose detail is a few percent, to the level of posters on the wall.
+What the flash changes in a picture is smooth, except at shadows: it multiplies the radiance by a slowly
+varying factor. In the logarithm of linear radiance that is an offset, which the local mean takes away; a
+division by the local contrast brings skin, whose detail is a few percent, to the level of posters.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def grey_radiance(
             max(1, round(width * max_side_px / longer)),
             max(1, round(height * max_side_px / longer)),
         )
-        grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+        grey = np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), np.float32)
         finite = cv2.resize(finite.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.999
     return grey, finite
 
@@ -85,7 +85,7 @@ def sharpness(grey: NDArray[np.float32]) -> float:
     for sigma in (1.0, 4.0):
         smooth = cv2.GaussianBlur(logarithm, (0, 0), sigma)
         response = sigma * sigma * cv2.Laplacian(smooth, cv2.CV_32F)
-        # The median of the strongest tenth: plain walls say nothing, one lamp should not say all.
+        # The strongest twentieth: plain walls say nothing, and one lamp should not say all.
         energies.append(float(np.percentile(np.abs(response), 95.0)))
     fine, coarse = energies
     return fine / coarse if coarse > 1e-6 else 0.0

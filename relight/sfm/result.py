@@ -92,7 +92,7 @@ def _size_warning(metric: bool, config: SfmConfig, board: Board | None) -> tuple
 
 
 def _corners(sparse: Sparse, mapped: Sequence[Look]) -> dict[int, NDArray[np.float64]]:
-    """Label to place of the printed corners that were reconstructed; those found as two points are left out."""
+    """Label to place of the printed corners that were reconstructed, those found as two points left out."""
     points: dict[int, set[int]] = {}
     for position, look in enumerate(mapped):
         labelled = np.flatnonzero(look.features.labels >= 0)

@@ -1,7 +1,7 @@
 """Which frames the reconstruction is made from; the others get their pose from it afterwards.
 
-Blurred frames have features at the wrong places, and frames from the same place add equations that say nothing
-of depth; both cost time and can lead the search astray.
+Blurred frames have features at the wrong places, and frames from the same place add equations that say
+nothing of depth; both cost time and can lead the search astray.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def choose_keyframes(looks: Sequence[Look], most: int) -> tuple[list[int], dict[
         looks: In the order of capture.
         most: Keyframes at most; more are thinned out evenly, unlit ones first.
     """
-    left_out = {i: "blurred" for i in blurred_frames([look.sharpness for look in looks])}
+    left_out = dict.fromkeys(blurred_frames([look.sharpness for look in looks]), "blurred")
     last: dict[bool, Look] = {}
     for i, look in enumerate(looks):
         if i in left_out:

@@ -70,7 +70,7 @@ def sparse_of(model: pycolmap.Reconstruction, looks: Sequence[Look]) -> Sparse:
     cameras = {}
     for number in sorted(model.reg_image_ids()):
         image, record = model.images[number], looks[number - 1].record
-        K, distortion = lens_of(image.camera, record.width, record.height)
+        K, distortion = lens_of(model.cameras[image.camera_id], record.width, record.height)
         cam_from_world = np.eye(4)
         cam_from_world[:3] = np.asarray(image.cam_from_world().matrix())
         cam_from_world[:3, :3] = nearest_rotation(cam_from_world[:3, :3])

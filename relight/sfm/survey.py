@@ -1,4 +1,4 @@
-"""One pass over a session's frames: features, sharpness and a thumbnail of each, one frame in memory at a time."""
+"""One pass over a session's frames: features, sharpness and a thumbnail of each, a frame at a time."""
 
 from __future__ import annotations
 

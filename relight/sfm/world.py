@@ -23,7 +23,7 @@ _UP_CAM = {
     270: np.array([1.0, 0.0, 0.0]),
 }
 _ROUNDS = 10
-_LEAST_CONVERGENCE = 1e-3  # least eigenvalue of the mean projector across the axes: 2.6 degrees of fan
+_LEAST_CONVERGENCE = 1e-3  # least eigenvalue of the mean projector across the axes: sin^2 of 1.8 degrees
 
 
 def canonical_world(
@@ -63,8 +63,8 @@ def canonical_world(
 def look_point(centres: Floats, axes: Floats, points: Floats) -> Floats:
     """[3] the point nearest to the cameras' optical axes, robustly.
 
-    Where the axes are as good as parallel they meet nowhere; then it is the middle of the cameras' view at the
-    median depth of the points.
+    Where the axes are as good as parallel they meet nowhere; then it is the middle of the cameras' view at
+    the median depth of the points.
 
     Args:
         centres: [N, 3].
