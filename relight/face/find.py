@@ -266,7 +266,7 @@ def _from_maps(
 ) -> FaceResult:
     maps = load_position_maps(Path(config.maps), cameras)
     chosen = {index: straight[index] for index in maps}
-    surface, plane = surface_of_maps(maps, chosen, points)
+    surface, plane = surface_of_maps(maps, chosen, points, normals)
     cosines = texel_cosines(surface, points, normals, chosen, progress)
     decision = FaceDecision(True, f"position maps of {len(maps)} frames are given")
     uv_px = torch.from_numpy(np.stack(list(maps.values())))

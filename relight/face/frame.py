@@ -23,6 +23,7 @@ _BESIDE = (0.12, 0.19)  # breadths from the plane: beside the wings of a nose, b
 _ABOVE = (0.15, 0.5)  # breadths above the tip between which the nose ends
 _BELOW = (0.07, 0.3)
 _FEWEST_LEVELS = 3
+_LONGEST = 0.24  # breadths that a nose may stand out; what does more has a neck beside it and is a chin
 _BEHIND = 0.1  # breadths that a tip may lie behind the foremost point: of a chin, where the head is tilted
 _FEWEST = 3
 
@@ -139,7 +140,7 @@ def _nose(levels: Floats, protrusion: Floats, middle: Floats, breadth: float) ->
     stands = protrusion[known]
     foremost = float(np.nanmax(middle))
     for k, (at, height) in enumerate(zip(np.flatnonzero(known), stands, strict=True)):
-        if foremost - middle[at] > _BEHIND * breadth:
+        if foremost - middle[at] > _BEHIND * breadth or height > _LONGEST:
             continue
         above = stands[(reach[:, k] > _ABOVE[0]) & (reach[:, k] < _ABOVE[1])]
         below = stands[(reach[:, k] < -_BELOW[0]) & (reach[:, k] > -_BELOW[1])]

@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from capture.cameras import Camera
 from relight.errors import PlanError
@@ -25,7 +26,8 @@ from relight.face.surface import TEXELS, FaceSurface
 
 _FARTHEST = 4.0  # picture sizes off the picture: further away it is no map of pixels
 _MOST_LIFTED = 40
-_SMOOTH_TEXELS = 2.0
+_SMOOTH_TEXELS = 1.5
+_NEIGHBOURS = 10
 
 
 def load_position_maps(folder: Path, cameras: Mapping[int, Camera]) -> dict[int, NDArray[np.float32]]:
@@ -51,7 +53,7 @@ def load_position_maps(folder: Path, cameras: Mapping[int, Camera]) -> dict[int,
 
 
 def surface_of_maps(
-    maps: Mapping[int, NDArray[np.float32]], cameras: Mapping[int, Camera], points: Floats
+    maps: Mapping[int, NDArray[np.float32]], cameras: Mapping[int, Camera], points: Floats, normals: Floats
 ) -> tuple[FaceSurface, Plane]:
     """The face's surface and plane of symmetry: the maps' texels brought onto the cloud.
 
@@ -72,18 +74,20 @@ def surface_of_maps(
             f"Only {valid.mean():.0%} of the texels of the position maps lie on the cloud; are they maps of "
             "these frames, in pixels?"
         )
-    middle = np.zeros((TEXELS, TEXELS, 3))
-    middle[valid] = np.nanmedian(lifted[:, valid], axis=0)
-    centres = np.stack([camera.centre_world for camera in cameras.values()]).mean(axis=0)
-    smooth, normals = _normals(middle, valid, centres)
+    places, directions = np.zeros((TEXELS, TEXELS, 3)), np.zeros((TEXELS, TEXELS, 3))
+    places[valid] = np.nanmedian(lifted[:, valid], axis=0)
+    weight = cv2.GaussianBlur(valid.astype(np.float64), (0, 0), _SMOOTH_TEXELS)
+    blurred = cv2.GaussianBlur(places, (0, 0), _SMOOTH_TEXELS)
+    places[valid] = blurred[valid] / weight[valid][:, None]
+    places[valid], directions[valid] = _onto_cloud(places[valid], points, normals)
     surface = FaceSurface(
-        torch.from_numpy(smooth.astype(np.float32)),
-        torch.from_numpy(normals.astype(np.float32)),
+        torch.from_numpy(places.astype(np.float32)),
+        torch.from_numpy(directions.astype(np.float32)),
         torch.from_numpy(valid),
         torch.from_numpy(valid.copy()),
         None,
     )
-    return surface, _plane(smooth, valid)
+    return surface, _plane(places, valid)
 
 
 def facing(uv_px: Floats) -> NDArray[np.bool_]:
@@ -121,18 +125,21 @@ def _read(path: Path, camera: Camera) -> NDArray[np.float32]:
     return uv_px.astype(np.float32)
 
 
-def _normals(points: Floats, valid: NDArray[np.bool_], towards: Floats) -> tuple[Floats, Floats]:
-    """Points smoothed over a few texels, and the normals of that surface on the side of the cameras."""
-    weight = cv2.GaussianBlur(valid.astype(np.float64), (0, 0), _SMOOTH_TEXELS)
-    blurred = cv2.GaussianBlur(points * valid[..., None], (0, 0), _SMOOTH_TEXELS)
-    smooth = np.where(valid[..., None], blurred / np.maximum(weight, 1e-6)[..., None], 0.0)
-    normals = np.cross(np.gradient(smooth, axis=1), np.gradient(smooth, axis=0))
-    length = np.linalg.norm(normals, axis=-1, keepdims=True)
-    inner = cv2.erode(valid.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-    normals = np.where(inner[..., None] & (length > 0), normals / np.maximum(length, 1e-30), 0.0)
-    if float((normals * (towards - smooth) * valid[..., None]).sum()) < 0:
-        normals = -normals
-    return smooth, normals
+def _onto_cloud(places: Floats, points: Floats, normals: Floats) -> tuple[Floats, Floats]:
+    """Places [T, 3] brought onto the tangent planes of the cloud about them, and its normals there [T, 3].
+
+    Depths read from pixels step by a pixel's and a point's width, which would spoil any normals of theirs.
+    """
+    good = np.isfinite(points).all(axis=1) & np.isfinite(normals).all(axis=1)
+    points, normals = points[good], normals[good]
+    distances, ids = cKDTree(points).query(places, k=min(_NEIGHBOURS, len(points)), workers=1)
+    width = np.maximum(np.median(distances, axis=1, keepdims=True), 1e-12)
+    weight = np.exp(-0.5 * (distances / width) ** 2)
+    weight /= weight.sum(axis=1, keepdims=True)
+    mean = (weight[..., None] * normals[ids]).sum(axis=1)
+    mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-9)
+    height = (weight * ((places[:, None] - points[ids]) * normals[ids]).sum(axis=-1)).sum(axis=1)
+    return places - height[:, None] * mean, mean
 
 
 def _plane(points: Floats, valid: NDArray[np.bool_]) -> Plane:

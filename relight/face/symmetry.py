@@ -26,8 +26,9 @@ _AZIMUTH_STEP_DEG = 6.0
 _TILTS_DEG = (-24.0, -16.0, -8.0, 0.0, 8.0, 16.0, 24.0)
 _OFFSETS = 17  # over 1.6 radii
 _REACH = 0.8  # radii from the middle of the cloud in which the plane is looked for
-_SEARCH_SAMPLES = 600
+_SEARCH_SAMPLES = 320
 _SCORE_SAMPLES = 3000
+_REFINE_SAMPLES = 4000
 _CANDIDATES = 6
 _RIVAL_DEG = 15.0  # planes further apart than this, or by _RIVAL_OFFSET radii, are different planes
 _RIVAL_OFFSET = 0.25
@@ -174,6 +175,7 @@ def refine_plane(
     """
     used = np.ones(len(samples.points), bool) if used is None else used
     which = np.flatnonzero(used)
+    which = which[_spread(len(which), _REFINE_SAMPLES)]
     points, normals = samples.points[which], samples.normals[which]
     for step in range(steps):
         tolerance = samples.radius * max(_FINE, _COARSE * 0.75**step)
