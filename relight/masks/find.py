@@ -14,7 +14,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -44,6 +44,7 @@ from relight.stages import Progress, no_progress
 _HULL_VIEWS = 12
 _FINEST_PX = 1280  # longest side at which outlines are sought; masks of larger frames are enlarged
 _MOST_WORKERS = 4
+_MOVED_PX = 0.8  # of the small picture: by less the outlines of masks and clouds differ anyway
 _NETWORK_LIMIT = 3.0  # log-odds
 
 _Result = TypeVar("_Result")
@@ -61,12 +62,18 @@ class _State:
     masks: dict[int, NDArray[np.uint8]] = field(default_factory=dict)
     flash: dict[int, NDArray[np.float16]] = field(default_factory=dict)
     separations: list[float] = field(default_factory=list)
+    shifts: dict[int, NDArray[np.float64]] = field(default_factory=dict)  # [2] of the head, small pixels
 
     @property
     def frames(self) -> list[Frame]:
         return list(self.source.frames.values())
 
-    def seen(self, camera: Camera) -> Silhouette:
+    def seen(self, frame: Frame, camera: Camera) -> Silhouette:
+        """The cloud in a frame, at a camera's size, displaced where the head is."""
+        if frame.index in self.shifts:
+            moved = camera.K.copy()
+            moved[:2, 2] += self.shifts[frame.index] * camera.width / frame.small.width
+            camera = replace(camera, K=moved)
         return silhouette(self.points, camera, self.subject.spacing, self.subject.noise)
 
 
@@ -188,7 +195,7 @@ def _add_flash(state: _State) -> None:
 
     def work(frame: Frame) -> tuple[Floats, float] | None:
         around = neighbours(frame, state.frames, 0, state.subject.distance)
-        seen = state.seen(frame.small)
+        seen = state.seen(frame, frame.small)
         if not around or not seen.inside.any():
             return None
         unlit = register(frame, around, state.source, seen.depth, seen.inside)
@@ -203,7 +210,7 @@ def _add_flash(state: _State) -> None:
 
 def _evidence(state: _State, frame: Frame) -> NDArray[np.float16]:
     """The sum of what flash, parallax and network say of a frame [h, w], without the cloud."""
-    seen = state.seen(frame.small)
+    seen = state.seen(frame, frame.small)
     odds = np.zeros(seen.depth.shape, np.float32)
     if frame.index in state.odds:
         odds += state.odds[frame.index]  # the network's
@@ -234,15 +241,20 @@ def _round(
     """
     former = dict(state.masks)
     votes = Votes(points)
-    for frame, mask in _each(state.frames, lambda frame: _small_mask(state, frame, former)):
+    for frame, (mask, shift) in _each(state.frames, lambda frame: _small_mask(state, frame, former)):
+        if np.hypot(*shift) > _MOVED_PX:
+            state.shifts[frame.index] = shift
         state.masks[frame.index] = np.round(255.0 * mask).astype(np.uint8)
         votes.add(mask, frame.small)
         step()
     return votes.share()
 
 
-def _small_mask(state: _State, frame: Frame, former: Mapping[int, NDArray[np.uint8]]) -> Floats:
-    seen = state.seen(frame.small)
+def _small_mask(
+    state: _State, frame: Frame, former: Mapping[int, NDArray[np.uint8]]
+) -> tuple[Floats, NDArray[np.float64]]:
+    """The small mask of a frame, and by how much [2] the head lies beside its cloud there, pixels."""
+    seen = state.seen(frame, frame.small)
     rotation_deg = state.source.rotation_deg
     odds = prior(seen, rotation_deg) + state.odds[frame.index]
     if former and state.config.hull:
@@ -253,23 +265,27 @@ def _small_mask(state: _State, frame: Frame, former: Mapping[int, NDArray[np.uin
         odds[claimed] += hull_evidence(
             frame.small, seen.depth, claimed, masks, [other.small for other in others]
         )
-    return solve(display(state.source.small(frame)), odds, seen)
+    mask = solve(display(state.source.small(frame)), odds, seen)
+    shift = outline_shift_px(mask, seen)
+    return mask, state.shifts.get(frame.index, np.zeros(2)) + shift
 
 
 def _finish(state: _State, frame: Frame, folder: Path) -> tuple[Floats, FrameOutcome]:
     """A frame's mask at full size, written; and what it is like."""
     longest = max(frame.camera.width, frame.camera.height)
     camera = frame.camera.scaled(min(1.0, _FINEST_PX / longest))
-    seen = state.seen(camera)
+    seen = state.seen(frame, camera)
     picture = display(shrunk(state.source.radiance(frame), camera))
     small = state.masks[frame.index].astype(np.float32) / np.float32(255.0)
     mask = refine(picture, small, seen)
+    shift = outline_shift_px(mask, seen)
+    before = state.shifts.get(frame.index, np.zeros(2))
     outcome = FrameOutcome(
         index=frame.index,
         coverage=float(mask.mean()),
         cloud_coverage=float(seen.inside.mean()),
         agreement=_iou(mask > 0.5, seen.inside),
-        shift_px=outline_shift_px(mask, seen) * longest / max(mask.shape),
+        shift_px=float(np.hypot(*(shift / max(mask.shape) + before / max(small.shape)))) * longest,
         longest_px=longest,
     )
     if mask.shape != (frame.camera.height, frame.camera.width):

@@ -22,6 +22,7 @@ from relight.errors import GeometryError
 
 Floats = NDArray[np.float32]
 
+_WIDEST_MARGIN = 0.25  # of a side: what a lens shows beyond that is repeated from the border
 _KEPT_SMALL = 48  # small pictures in memory: more than the neighbours of the frames in hand
 _CENTRES = np.array([[1.0, 0.0, -0.5], [0.0, 1.0, -0.5], [0.0, 0.0, 1.0]])  # to OpenCV's integer centres
 
@@ -32,7 +33,7 @@ class Frame:
 
     Attributes:
         index: The frame's number in the session.
-        camera: Without distortion, full size.
+        camera: Without distortion, full size; somewhat larger than the frame where its lens sees more.
         small: The same camera in the size of the small pictures.
         flash: 1, 0, or None = partial or unknown.
     """
@@ -75,6 +76,7 @@ class FrameSource:
                 continue
             if camera.distortion.any():
                 self._distorted[record.index] = camera
+                camera = straight_camera(camera)
             camera = replace(camera, distortion=np.zeros(0), flash=record.flash)
             small = camera.scaled(min(1.0, working_px / max(camera.width, camera.height)))
             self._records[record.index] = record
@@ -111,15 +113,10 @@ class FrameSource:
         distorted = self._distorted.get(frame.index)
         if distorted is None:
             return mask
-        height, width = mask.shape
-        grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(np.float64)
-        straight = cv2.undistortPoints(
-            grid.reshape(-1, 1, 2),
-            _CENTRES @ distorted.K,
-            distorted.distortion,
-            P=_CENTRES @ frame.camera.K,
-        )
-        places = np.asarray(straight, np.float32).reshape(height, width, 2)
+        width, height = distorted.width, distorted.height
+        pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1) + 0.5
+        straight = _straight_px(pixels.reshape(-1, 2), distorted, frame.camera.K)
+        places = (straight.reshape(height, width, 2) - 0.5).astype(np.float32)
         result = cv2.remap(
             mask, places[..., 0], places[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
         )
@@ -138,6 +135,39 @@ class FrameSource:
         )
         result = cv2.remap(radiance, *grid, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         return np.asarray(result, np.float32)
+
+
+def straight_camera(distorted: Camera) -> Camera:
+    """The pinhole whose picture holds all that a lens shows, its focal length and scale kept."""
+    width, height = distorted.width, distorted.height
+    along, across = np.linspace(0, width, 33), np.linspace(0, height, 33)
+    border = [np.stack(np.meshgrid(along, [0.0, height]), axis=-1).reshape(-1, 2)]
+    border += [np.stack(np.meshgrid([0.0, width], across), axis=-1).reshape(-1, 2)]
+    seen = _straight_px(np.concatenate(border), distorted, distorted.K)
+    most = _WIDEST_MARGIN * max(width, height)
+    left, top = (int(np.clip(np.ceil(-low), 0, most)) for low in seen.min(axis=0))
+    right, bottom = (
+        int(np.clip(np.ceil(high - side), 0, most))
+        for high, side in zip(seen.max(axis=0), (width, height), strict=True)
+    )
+    shift = np.array([[0.0, 0.0, left], [0.0, 0.0, top], [0.0, 0.0, 0.0]])
+    return replace(
+        distorted,
+        width=width + left + right,
+        height=height + top + bottom,
+        K=distorted.K + shift,
+        distortion=np.zeros(0),
+    )
+
+
+def _straight_px(
+    pixels: NDArray[np.floating], distorted: Camera, K: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Where pixels [N, 2] of a lens's picture are in that of a pinhole K; centres at 0.5 in both."""
+    straight = cv2.undistortPoints(
+        np.ascontiguousarray(pixels).reshape(-1, 1, 2), distorted.K, distorted.distortion, P=K
+    )
+    return np.nan_to_num(np.asarray(straight, np.float64).reshape(-1, 2), posinf=0.0, neginf=0.0)
 
 
 def shrunk(picture: Floats, small: Camera) -> Floats:

@@ -19,8 +19,8 @@ from relight.masks.subject import SubjectCloud
 
 NOTHING, EVERYTHING = 0.003, 0.97
 """Shares of a picture that count as nothing and as all of it."""
-MOVED_SHARE = 0.012
-"""Of the longer side of a picture: outlines further from the cloud's mean a head that moved (6 px of 512)."""
+MOVED_SHARE = 0.009
+"""Of the longer side of a picture: outlines further from the cloud's mean a head that moved (5 px of 512)."""
 
 _DISAGREEMENT = 0.85  # intersection over union of masks and silhouettes
 _FEWEST_KEPT = 0.5
@@ -47,8 +47,8 @@ class FrameOutcome:
     longest_px: int
 
 
-def outline_shift_px(mask: Floats, seen: Silhouette) -> float:
-    """Length of the displacement that takes the cloud's outline nearest to the mask's [H, W].
+def outline_shift_px(mask: Floats, seen: Silhouette) -> NDArray[np.float64]:
+    """Displacement [2] (right, down) that takes the cloud's outline nearest to the mask's [H, W].
 
     The signed distance of the mask's outline from the cloud's is the displacement along the normal, plus a
     constant (masks and clouds may be a bit wide): linear least squares, twice reweighted.
@@ -58,7 +58,7 @@ def outline_shift_px(mask: Floats, seen: Silhouette) -> float:
     distance = cv2.GaussianBlur(seen.distance_px, (0, 0), 2.0)
     near = outline & (np.abs(distance) < 0.06 * max(mask.shape))
     if np.count_nonzero(near) < 50:
-        return 0.0
+        return np.zeros(2)
     normal = [cv2.Sobel(distance, cv2.CV_32F, dx, 1 - dx, ksize=3)[near] / 8.0 for dx in (1, 0)]
     rows = np.stack([*normal, np.ones_like(normal[0])], axis=1).astype(np.float64)
     values = distance[near].astype(np.float64)
@@ -69,7 +69,7 @@ def outline_shift_px(mask: Floats, seen: Silhouette) -> float:
         solution = np.linalg.solve(left, rows.T @ (weight * values))
         residual = np.abs(values - rows @ solution)
         weight = 1.0 / (1.0 + (residual / 1.5) ** 2)
-    return float(np.hypot(solution[0], solution[1]))
+    return solution[:2]
 
 
 def check(outcomes: Sequence[FrameOutcome]) -> None:

@@ -3,8 +3,9 @@
 For structure from motion, which may leave a moving background out by them, and to find the region where a
 cloud is wanted. A lit frame and its unlit neighbours in time are aligned by dense flow (DIS, Kroeger 2016) on
 pictures whose light is taken out. Their ratio is split into near and far by its own histogram, and so is
-their difference: the ratio finds dark hair, the difference what a window lights too. Unlit frames take the evidence of the lit ones beside them along the flow. Where light falls off evenly (no head
-before a wall) no mask is given.
+their difference: the ratio finds dark hair, the difference what a window lights too. Unlit frames take the
+evidence of the lit ones beside them along the flow. Where the light falls into one heap (no head before a
+wall) no mask is given.
 """
 
 from __future__ import annotations
@@ -154,7 +155,8 @@ def _carried(
 def _flow(picture: Floats, other: Floats) -> Floats:
     """[h, w, 2] from a picture's pixels to where they are in another, under whatever light."""
     estimator = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    return np.asarray(estimator.calc(_unlit_grey(picture), _unlit_grey(other), None), np.float32)
+    flow = np.zeros((*picture.shape[:2], 2), np.float32)
+    return np.asarray(estimator.calc(_unlit_grey(picture), _unlit_grey(other), flow), np.float32)
 
 
 def _unlit_grey(picture: Floats) -> NDArray[np.uint8]:
@@ -175,7 +177,7 @@ def _along(picture: Floats, flow: Floats) -> Floats:
 
 
 def _split(ratio: Floats, trust: Floats) -> Floats | None:
-    """Log-odds [h, w] by the two heaps that the values of a frame fall into (Otsu 1979), None for one heap."""
+    """Log-odds [h, w] by the two heaps that a frame's values fall into (Otsu 1979), None for one heap."""
     sure = ratio[trust > 0.3]
     if sure.size < 200:
         return None
@@ -198,9 +200,8 @@ def _split(ratio: Floats, trust: Floats) -> Floats | None:
 
 def _solid(mask: Floats) -> Floats:
     """The largest piece of a mask, its holes filled."""
-    solid = (mask > 0.5).astype(np.uint8)
-    solid = cv2.morphologyEx(solid, cv2.MORPH_OPEN, np.ones((5, 5), np.uint8))
-    count, labels, statistics, _ = cv2.connectedComponentsWithStats(solid, connectivity=4)
+    opened = cv2.morphologyEx((mask > 0.5).astype(np.uint8), cv2.MORPH_OPEN, np.ones((5, 5), np.uint8))
+    count, labels, statistics, _ = cv2.connectedComponentsWithStats(opened, connectivity=4)
     if count < 2:
         return np.zeros_like(mask)
     largest = labels == 1 + int(np.argmax(statistics[1:, cv2.CC_STAT_AREA]))

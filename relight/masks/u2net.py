@@ -162,8 +162,9 @@ def load_u2net(path: Path) -> U2Net:
     return network.eval()
 
 
-def network_input(radiance: Floats, side_px: int = INPUT_PX) -> torch.Tensor:
+def network_input(radiance: Floats, side_px: int | None = None) -> torch.Tensor:
     """A linear picture [H, W, 3] as the network takes it: [1, 3, side, side], sRGB, normalised."""
+    side_px = side_px or INPUT_PX
     small = cv2.resize(radiance, (side_px, side_px), interpolation=cv2.INTER_AREA)
     srgb = to_display(np.clip(small, 0.0, 1.0), "srgb")
     srgb = srgb / max(float(srgb.max()), 1e-6)  # as the published code does
