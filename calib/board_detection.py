@@ -132,7 +132,9 @@ class BoardDetector:
         # Corners along one line fix no pose: the second extent must be most of a square.
         if np.linalg.svd(places - places.mean(0), compute_uv=False)[1] < self.board.square_m:
             return Failure(Problem.PARTIAL, candidates)
-        opencv_px = _refined(grey, self._boards[layout], found, corners.reshape(-1, 2)[order])
+        opencv_px = _refined(
+            grey, self._boards[layout], found, np.asarray(corners, np.float32).reshape(-1, 2)[order]
+        )
         width_px, square_px = _edge_width(grey, self.board, found, opencv_px)
         if width_px > max(_BLURRED_PX, _BLURRED_SHARE * square_px):
             return Failure(Problem.BLURRED, candidates)

@@ -106,8 +106,13 @@ def _too_few(
         )
     if not refused:
         return IntrinsicsError(f"{head}. Take more: near and far, tilted to all sides, in all corners.")
-    diagnoses = [(name, *detector.diagnose(grey)) for name, grey in refused]
-    kinds = Counter(problem for _, problem, _ in diagnoses)
+    diagnoses: list[tuple[str, Problem, str]] = []
+    kinds: Counter[Problem] = Counter()
+    for name, grey in refused:
+        diagnoses.append((name, *detector.diagnose(grey)))
+        kinds[diagnoses[-1][1]] += 1
+        if max(kinds.values()) == 2:
+            break
     common = kinds.most_common(1)[0][0]
     name, _, detail = next(entry for entry in diagnoses if entry[1] is common)
     count = sum(collected.problems.values())

@@ -111,7 +111,16 @@ def check_determined(observations: Observations, solution: Solution, uncertainty
     """
     sigma = np.sqrt(np.diag(uncertainty.covariance))
     focal = solution.lens[:2]
-    if not (sigma[:2] <= _LARGEST_FOCAL_SIGMA * focal).all():
+    uncertain = not (sigma[:2] <= _LARGEST_FOCAL_SIGMA * focal).all()
+    if uncertain and uncertainty.correlation_factor > _CLEAR_CORRELATION:
+        raise IntrinsicsError(
+            f"The pictures contradict each other: the focal length is {focal.mean():.0f} px to within "
+            f"{sigma[:2].max():.0f} px (limit {_LARGEST_FOCAL_SIGMA:.0%}), far more than the corners' noise "
+            f"of {uncertainty.noise_px:.2f} px explains. The squares are not square (printed to fit the "
+            "page?), the "
+            "board is not flat, or the camera focuses, zooms or stabilises while it films."
+        )
+    if uncertain:
         raise IntrinsicsError(
             f"The focal length is {focal.mean():.0f} px with an uncertainty of {sigma[:2].max():.0f} px "
             "(limit "

@@ -14,9 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.intrinsics import IntrinsicsResult
+from calib.lens_terms import LENS_MODELS, LENS_NAMES
 from calib.lens_uncertainty import pixel_grid, projection_sigma
 from calib.plots import arrows, bars, curve_path, dots, heat_map, histogram, svg
-from calib.projection import LENS_MODELS, LENS_NAMES, project, rays_of
+from calib.projection import project, rays_of
 from capture.atomic import atomic_write
 
 Floats = NDArray[np.float64]

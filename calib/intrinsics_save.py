@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from calib.calibration import Calibration, Intrinsics, Quantity, save_calibration
 from calib.intrinsics import IntrinsicsResult
+from calib.lens_terms import LENS_MODELS, LENS_NAMES
 from calib.lens_uncertainty import pixel_grid, projection_sigma
-from calib.projection import LENS_MODELS, LENS_NAMES
 from capture.atomic import atomic_write
 
 _SCHEMA, _SCHEMA_VERSION = "relight-intrinsics-evidence", 1

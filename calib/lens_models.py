@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.bundle import BEND, Observations, Solution, minimise
-from calib.projection import LENS_MODELS, free_entries
+from calib.lens_terms import LENS_MODELS
+from calib.projection import free_entries
 
 RICHEST = "k1k2p1p2k3"
 _PARTS = 5

@@ -14,19 +14,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.lens_terms import LENS_NAMES
+
 Floats = NDArray[np.float64]
 
-LENS_SIZE = 9
-#: Names of the entries of `lens`.
-LENS_NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
-#: Distortion models in the order of their number of terms: name -> terms.
-LENS_MODELS: dict[str, tuple[str, ...]] = {
-    "none": (),
-    "k1": ("k1",),
-    "k1k2": ("k1", "k2"),
-    "k1k2p1p2": ("k1", "k2", "p1", "p2"),
-    "k1k2p1p2k3": ("k1", "k2", "p1", "p2", "k3"),
-}
+LENS_SIZE = len(LENS_NAMES)
 # Points nearer to the camera's plane than this share of their distance do not project; they are put there.
 _NEAREST_Z = 1e-6
 

@@ -12,7 +12,7 @@ from typing import Any
 
 _LARGEST_TEXT = 1 << 20
 _DEEPEST = 20
-_KEY = re.compile(r"^([^\s:#\[\]{},\"'][^:#\[\]{},\"']*?|\"[^\"]*\"|'[^']*')\s*:(?:\s+(.*)|)$")
+_KEY = re.compile(r"^(\"[^\"]*\"|'[^']*'|[^:#\[\]{},\"']+):(?:\s+(.*))?$")
 _TOKEN = re.compile(r"\s*([\[\],]|\"[^\"]*\"|'[^']*'|[^\[\],\s][^\[\],]*)")
 
 
@@ -89,7 +89,7 @@ def _block(lines: list[_Line], at: int, indent: int, depth: int) -> tuple[Any, i
         match = _KEY.match(line.text)
         if match is None:
             raise ValueError(f"line {line.number} is no 'name: value'")
-        key = match[1].strip("\"'")
+        key = match[1].strip().strip("\"'")
         if key in mapping:
             raise ValueError(f"{key!r} appears twice, again in line {line.number}")
         value = re.sub(r"^!\S+\s*", "", (match[2] or "").strip())

@@ -23,6 +23,10 @@ _COMMANDS = {
     "render": ("relight.commands.render", "relit pictures, maps or an orbit video of a portrait"),
     "evaluate": ("relight.commands.evaluate", "measure a portrait against the truth"),
     "report": ("relight.commands.report", "write report.html of a portrait again"),
+    "calibrate": (
+        "relight.commands.calibrate",
+        "print a board, and find a camera's lens from pictures of it",
+    ),
 }
 
 _ABOUT = "From a blinking flash to a relightable head."
@@ -50,7 +54,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _parser(arguments: Sequence[str]) -> argparse.ArgumentParser:
     """Knows all commands by name, but imports only the module of the one that the arguments name."""
     parser = argparse.ArgumentParser(prog="relight", description=_ABOUT, epilog=_EPILOG)
-    parser.add_argument("--version", action=_Version)
+    parser.add_argument("-V", "--version", action=_Version)
     parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
     subparsers = parser.add_subparsers(metavar="COMMAND", required=True)
     for name, (module_name, summary) in _COMMANDS.items():

@@ -4,7 +4,7 @@ import pytest
 from calib.bundle import observations_of
 from calib.intrinsics import calibrate_intrinsics
 from calib.lens_models import choose_model, free_of, with_only
-from calib.projection import LENS_MODELS
+from calib.lens_terms import LENS_MODELS
 
 
 @pytest.mark.parametrize(
