@@ -24,8 +24,6 @@ class StereoConfig:
         depth_tolerance: Relative difference of depths that still agree.
         fewest_maps: Depth maps, its own included, that must agree on a point.
         cell_px: Side of the cube that one point stands for, in pixels of the nearer views.
-        photometric: Whether points are moved so that the surface agrees with photometric normals at fine
-            scale.
     """
 
     references: int = 40
@@ -41,7 +39,6 @@ class StereoConfig:
     depth_tolerance: float = 0.008
     fewest_maps: int = 3
     cell_px: float = 0.85
-    photometric: bool = False
 
 
 @dataclass(frozen=True, eq=False)

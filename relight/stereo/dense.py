@@ -15,6 +15,7 @@ from capture.session import Session
 from relight.errors import GeometryError
 from relight.head_region import HeadRegion, find_head_region
 from relight.stages import Progress, no_progress
+from relight.stereo.completion import completed
 from relight.stereo.config import DenseCloud, StereoConfig
 from relight.stereo.depth import DepthMap, estimate_about, estimate_depth
 from relight.stereo.exposure import pair_gain
@@ -64,19 +65,20 @@ def dense_cloud(
     frames = GreyFrames(session, cameras, torch.device(device), _KEPT_PICTURES)
     sparse = np.zeros((0, 3)) if sparse_points is None else np.asarray(sparse_points, np.float64)
     work = _Work(frames, region, sparse[np.isfinite(sparse).all(axis=1)], config)
+    hull = visual_hull(frames, region)
     try:
         cloud = work.stereo(progress)
+        if hull is not None:
+            cloud = completed(cloud, hull, frames)
     except GeometryError as failure:
-        hull = visual_hull(frames, region)
         if hull is None:
             raise
-        points, normals, used = hull
         cloud = DenseCloud(
-            points,
-            normals,
-            np.zeros(len(points), np.float32),
-            {"method": "visual hull", "masks": used},
-            (f"The cloud is only the visual hull of {used} masks, without hollows: {failure}",),
+            hull.points,
+            hull.normals_world,
+            np.zeros(len(hull.points), np.float32),
+            {"method": "visual hull", "masks": hull.masks},
+            (f"The cloud is only the visual hull of {hull.masks} masks, without hollows: {failure}",),
         )
     cloud.report["points"] = len(cloud.points)
     cloud.report["region"] = {

@@ -61,7 +61,7 @@ class LevelSettings:
 COARSE = LevelSettings(0.25, 2, 0, 0.7, 0.001, 0.5, 0.1, 2.5)
 MIDDLE = LevelSettings(0.5, 2, 7, 0.6, 0.002, 0.5, 0.02, 0.1)
 FINE = LevelSettings(1.0, 3, 4, 0.35, 0.003, 0.3, 0.02, 0.1)
-AGAIN = LevelSettings(1.0, 3, 6, 0.35, 0.003, 0.3, 0.02, 0.1)
+AGAIN = LevelSettings(1.0, 3, 4, 0.4, 0.003, 0.3, 0.02, 0.1)
 
 
 @dataclass(frozen=True, eq=False)

@@ -67,6 +67,10 @@ class GreyFrames:
         self._kept.move_to_end(key)
         return self._kept[key]
 
+    def has_mask(self, index: int) -> bool:
+        """Whether the session has a mask of a frame."""
+        return self._session.mask_path(index).is_file()
+
     def mask(self, index: int) -> NDArray[np.float32] | None:
         """[H, W] 0..1 coverage of the subject, undistorted; None where the session has no mask."""
         coverage = self._session.load_mask(self._records[index])

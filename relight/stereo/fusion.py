@@ -12,7 +12,8 @@ from relight.stereo.depth import DepthMap
 
 _EDGE_PX = 3  # windows reach over an edge of the surface by their radius
 _STEP = 6.0  # depth between neighbouring pixels, in widths of a pixel, that is an edge: 80 degrees of slant
-_GRAZING = 0.17  # cosine, the same
+_GRAZING = 0.12  # cosine
+_SLANTED = 3.0  # tolerances by which depths may differ where the surfaces do not
 _SEES_THROUGH = 3.0  # tolerances by which a point lies before what another map sees
 
 
@@ -97,11 +98,13 @@ def agree(own: CheckedMap, others: Sequence[CheckedMap], tolerance: float) -> Ag
     for other in others:
         inverse, valid, z, inside = _looked_up(points, other)
         behind = z * inverse - 1.0
-        near = inside & valid & (behind.abs() < tolerance)
         centre = torch.as_tensor(other.depth.camera.centre_world).to(points)
         along = points - centre
         theirs = along / (behind + 1.0).clamp(min=1e-3)[:, None] - along
-        shift += torch.where(near, (theirs * normals).sum(dim=-1), 0.0)
+        # On a slanted surface depths differ by more than the surfaces are apart.
+        apart = (theirs * normals).sum(dim=-1)
+        near = inside & valid & (apart.abs() < tolerance * z) & (behind.abs() < _SLANTED * tolerance)
+        shift += torch.where(near, apart, 0.0)
         support += near
         through = inside & (behind < -_SEES_THROUGH * tolerance)
         against += through

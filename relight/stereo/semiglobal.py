@@ -43,12 +43,13 @@ def _along(
     path = torch.empty_like(cost, memory_format=torch.contiguous_format)
     path[0] = cost[0]
     width = cost.shape[1]
+    none = torch.zeros_like(cost[0, :1])  # a path that enters at the side begins there
     for row in range(1, len(cost)):
         before = path[row - 1]
         if right == 1:
-            before = torch.cat([before[:1], before[: width - 1]])
+            before = torch.cat([none, before[: width - 1]])
         elif right == -1:
-            before = torch.cat([before[1:], before[width - 1 :]])
+            before = torch.cat([before[1:], none])
         least = before.amin(dim=1, keepdim=True)
         best = torch.minimum(before, least + jump[row][:, None])
         best[:, 1:] = torch.minimum(best[:, 1:], before[:, :-1] + step)

@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import torch
 
+_GRADUATION = 6.0
+
 
 def smoothed(
     values: torch.Tensor,
@@ -29,8 +31,10 @@ def smoothed(
         reweightings: How often the creases are found.
     """
     solution = values
-    for _ in range(reweightings):
-        plates = [_plate(second, crease) for second in _second_differences(solution)]
+    for step in range(reweightings):
+        # Graduated: single outliers look like creases at first, and would stay.
+        width = crease * _GRADUATION ** (reweightings - 1 - step)
+        plates = [_plate(second, width) for second in _second_differences(solution)]
         solution = _solved(values, weight, [stiffness * plate for plate in plates], solution, iterations)
     return solution
 
