@@ -46,8 +46,12 @@ _THIRD = 0.45
 _CLEAR = 5.0  # spreads of the noise above which the gain of a third says something
 _LEAST_LOG_GAIN = 0.03
 _LEAST_CHANGES = 3  # from lit to unlit or back: one or two may be the room's lamp or the sun
-_NEAR_OVER_FAR = 1.2  # the centre's log gain over the corners': light that is everywhere is no flash
+_NEAR_OVER_FAR = 1.4  # the centre's log gain over the corners': light that is everywhere is no flash
 _NEARLY_WHITE = 0.4  # mean radiance of the lit centre, of which a good part is then clipped
+_STRONG = 0.7  # log gain: the flash doubles the light
+_MOST_DARKENED = 0.25  # of the centre's gain, by which noise may make the corners darker
+# Stills need more than a video: where one step is missed a whole run of pictures is mistaken.
+_STRICTER = 2.0
 _RISK = 0.01  # of a label
 _MOST_UNKNOWN = 0.25  # share of the pictures: where more are in doubt, all are
 
@@ -95,10 +99,11 @@ def tag_stills(profiles: FrameProfiles, config: TaggingConfig | None = None) -> 
             "all of them or none, or it is too weak for the room; name the lit ones in a flash list, or "
             "take pictures of both kinds in turn."
         )
-    if model.separation < config.min_separation:
+    least = _STRICTER * config.min_separation
+    if model.separation < least:
         raise TaggingError(
             f"The pictures do not fall into lit and unlit ones (separation {model.separation:.1f}, at least "
-            f"{config.min_separation:g} needed; gain {100 * np.expm1(model.gain[0]):.0f} %): the flash lit "
+            f"{least:g} needed; gain {100 * np.expm1(model.gain[0]):.0f} %): the flash lit "
             "all of them or none, or it is too weak for the room; name the lit ones in a flash list."
         )
     tags = _tags(profiles, seen, model, _is_patchy(steps, model.lit), config)
@@ -162,7 +167,7 @@ def _evened(steps: Steps, radiance: Floats, gain: float) -> list[Floats]:
     """The steps as if the room lit the head equally from everywhere.
 
     The flash goes with the camera and adds about the same light c to each picture; the room's light r on what
-    the camera sees may be a third of it on the dark side of the head, where the gain log(1 + c / r) is larger.
+    the camera sees may be a third of it on the dark side of the head, where a gain log(1 + c / r) is larger.
     The darkest of some pictures in a row is taken to be unlit.
     """
     room = ndimage.minimum_filter1d(np.maximum(radiance, 1e-4), 2 * _DARKEST_OF + 1, mode="nearest")
@@ -186,14 +191,18 @@ def _settled(steps: Steps, radiance: Floats, model: _Model) -> _Model:
 
 
 def _credible(model: _Model) -> bool:
-    """Whether the pictures change as a flash changes them: often enough, and the near more than the far.
+    """Whether the pictures change as by a flash: often enough, and the near more than the far.
 
-    Where the middle of the lit pictures is nearly white its gain is cut off, and is not compared.
+    A flash takes light from nothing. Where a strong one makes the middle nearly white its gain is cut off, and
+    is not compared with that of the corners.
     """
     changes = np.count_nonzero(np.diff(model.lit.astype(int)))
     near, far = model.gain[0], model.gain[-1]
-    nearer = near > _NEAR_OVER_FAR * far or model.lit_radiance > _NEARLY_WHITE
-    return bool(changes >= _LEAST_CHANGES and near > _LEAST_LOG_GAIN and nearer)
+    cut_off = model.lit_radiance > _NEARLY_WHITE and near > _STRONG
+    nearer = near > _NEAR_OVER_FAR * far or cut_off
+    return bool(
+        changes >= _LEAST_CHANGES and near > _LEAST_LOG_GAIN and nearer and far > -_MOST_DARKENED * near
+    )
 
 
 def _learn(steps: Steps, radiance: Floats, lit: Labels) -> _Model | None:
