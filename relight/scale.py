@@ -26,8 +26,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capture.cameras import Camera
-from relight.face.find import HeadFound, find_head
 from relight.face.frame import HeadFrame
+from relight.face.head import HeadFound, find_head
 from relight.face.plane import Floats
 from relight.face.samples import Samples
 from relight.scale_from_flash import FlashSamples, scale_from_flash

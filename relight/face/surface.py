@@ -75,34 +75,15 @@ def unroll(points: Floats, normals: Floats, albedo: Floats | None, frame: HeadFr
     kept = np.flatnonzero(near)
     if len(kept) > 4 * _NEIGHBOURS:
         kept = kept[_outermost(angle[kept], local[kept, 1], radius[kept])]
-    rows, columns = texel_places()
     if len(kept) <= 4 * _NEIGHBOURS:
         nothing = torch.zeros(TEXELS, TEXELS, 3)
         none = torch.zeros(TEXELS, TEXELS, dtype=torch.bool)
         return FaceSurface(nothing, nothing.clone(), none, none.clone(), None)
-    flat = np.stack([angle[kept] * _ROLLED, local[kept, 1]], axis=1)
-    tree = cKDTree(flat)
-    spacing = float(np.median(tree.query(flat[:: max(1, len(flat) // 4000)], k=[5], workers=1)[0])) / 1.26
-    at = np.stack(np.meshgrid(columns * _ROLLED, rows, indexing="xy"), axis=-1).reshape(-1, 2)
-    distances, ids = tree.query(at, k=_NEIGHBOURS, workers=1)
-    weight = np.exp(-0.5 * (distances**2 - distances[:, :1] ** 2) / spacing**2)
-    rays = np.stack([np.sin(at[:, 0] / _ROLLED), np.zeros(len(at)), np.cos(at[:, 0] / _ROLLED)], axis=1)
-    feet = np.stack([np.zeros(len(at)), at[:, 1], np.zeros(len(at))], axis=1)
-    near_points, near_normals = local[kept][ids], turned[kept][ids]
-    slant = (near_normals * rays[:, None]).sum(axis=-1)
-    # Where the ray meets the neighbours' tangent planes; of planes along the ray, the neighbour itself.
-    lengths = ((near_points - feet[:, None]) * near_normals).sum(axis=-1) / np.maximum(slant, 0.2)
-    own = radius[kept][ids]
-    lengths = np.clip(lengths, own - 3 * spacing, own + 3 * spacing)
-    middle = np.median(lengths, axis=1, keepdims=True)
-    weight /= 1.0 + ((lengths - middle) / (2.0 * spacing)) ** 2
-    weight /= weight.sum(axis=1, keepdims=True)
-    reach = (weight * lengths).sum(axis=1)
-    direction = (weight[..., None] * near_normals).sum(axis=1)
+    rays, feet, weight, ids, valid, reach = _reached(local[kept], turned[kept], angle[kept], radius[kept])
+    direction = (weight[..., None] * turned[kept][ids]).sum(axis=1)
     length = np.linalg.norm(direction, axis=1, keepdims=True)
-    valid = (distances[:, 0] < max(_GAP * spacing, 2.0 / TEXELS)) & (length[:, 0] > 0.3)
+    valid &= length[:, 0] > 0.3
     shape = (TEXELS, TEXELS)
-    world = frame.world(feet + reach[:, None] * rays)
     normal = np.where(valid[:, None], direction / np.maximum(length, 1e-6), 0.0) @ frame.axes
     colours = None
     if albedo is not None:
@@ -110,7 +91,7 @@ def unroll(points: Floats, normals: Floats, albedo: Floats | None, frame: HeadFr
         colours = colours.reshape(*shape, 3)
     valid = valid.reshape(shape)
     return FaceSurface(
-        points=_tensor(world.reshape(*shape, 3)),
+        points=_tensor(frame.world(feet + reach[:, None] * rays).reshape(*shape, 3)),
         normals_world=_tensor(normal.reshape(*shape, 3)),
         valid=torch.from_numpy(valid),
         region=torch.from_numpy(_region(valid, reach.reshape(shape), colours)),
@@ -122,6 +103,35 @@ def texel_places() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Heights [256] of the rows in breadths, and angles [256] of the columns in radians."""
     steps = (np.arange(TEXELS) + 0.5) / TEXELS
     return TOP + (BOTTOM - TOP) * steps, HALF_ANGLE_RAD * (2.0 * steps - 1.0)
+
+
+def _reached(
+    local: Floats, turned: Floats, angle: Floats, radius: Floats
+) -> tuple[Floats, Floats, Floats, NDArray[np.int64], NDArray[np.bool_], Floats]:
+    """Where the texels' rays leave the surface of points in the head's frame.
+
+    Returns:
+        Rays [T, 3] and their feet on the axis [T, 3], breadths; weights [T, k] and ids [T, k] of the points
+        about them; whether there are any near enough [T]; lengths of the rays [T].
+    """
+    flat = np.stack([angle * _ROLLED, local[:, 1]], axis=1)
+    tree = cKDTree(flat)
+    spacing = float(np.median(tree.query(flat[:: max(1, len(flat) // 4000)], k=[5], workers=1)[0])) / 1.26
+    rows, columns = texel_places()
+    at = np.stack(np.meshgrid(columns * _ROLLED, rows, indexing="xy"), axis=-1).reshape(-1, 2)
+    distances, ids = tree.query(at, k=_NEIGHBOURS, workers=1)
+    weight = np.exp(-0.5 * (distances**2 - distances[:, :1] ** 2) / max(spacing, 1e-12) ** 2)
+    rays = np.stack([np.sin(at[:, 0] / _ROLLED), np.zeros(len(at)), np.cos(at[:, 0] / _ROLLED)], axis=1)
+    feet = np.stack([np.zeros(len(at)), at[:, 1], np.zeros(len(at))], axis=1)
+    slant = (turned[ids] * rays[:, None]).sum(axis=-1)
+    # Where the ray meets the neighbours' tangent planes; of planes along the ray, the neighbour itself.
+    lengths = ((local[ids] - feet[:, None]) * turned[ids]).sum(axis=-1) / np.maximum(slant, 0.2)
+    lengths = np.clip(lengths, radius[ids] - 3 * spacing, radius[ids] + 3 * spacing)
+    middle = np.median(lengths, axis=1, keepdims=True)
+    weight /= 1.0 + ((lengths - middle) / max(2.0 * spacing, 1e-12)) ** 2
+    weight /= weight.sum(axis=1, keepdims=True)
+    valid = distances[:, 0] < max(_GAP * spacing, 2.0 / TEXELS)
+    return rays, feet, weight, ids, valid, (weight * lengths).sum(axis=1)
 
 
 def _outermost(angle: Floats, height: Floats, radius: Floats) -> NDArray[np.int64]:
@@ -143,7 +153,7 @@ def _outermost(angle: Floats, height: Floats, radius: Floats) -> NDArray[np.int6
 
 
 def _region(
-    valid: NDArray[np.bool_], radius: NDArray[np.float64], albedo: NDArray[np.float64] | None
+    valid: NDArray[np.bool_], radius: Floats, albedo: NDArray[np.float64] | None
 ) -> NDArray[np.bool_]:
     """Where the face is: an oval without the neck, and in it what hangs together with the nose."""
     rows, columns = texel_places()

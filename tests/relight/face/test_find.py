@@ -11,7 +11,7 @@ from face_shapes import arc_of_cameras, seen_by, shape
 from capture.cameras import Camera
 from relight.errors import PlanError
 from relight.face import FaceConfig, decide, find_face
-from relight.face.find import up_and_towards
+from relight.face.head import up_and_towards
 from relight.face.landmarks import MIDDLE, PAIRS, detect_landmarks
 from relight.face.map_files import facing, load_position_maps
 from relight.face.symmetry import Symmetry

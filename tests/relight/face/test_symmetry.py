@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from face_shapes import arc_of_cameras, rotation, seen_by, shape, sitter, spoiled
 
-from relight.face.find import find_head
 from relight.face.frame import head_frame
+from relight.face.head import find_head
 from relight.face.head_part import head_floor
 from relight.face.plane import Plane
 from relight.face.samples import take_samples
