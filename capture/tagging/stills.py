@@ -193,8 +193,8 @@ def _settled(steps: Steps, radiance: Floats, model: _Model) -> _Model:
 def _credible(model: _Model) -> bool:
     """Whether the pictures change as by a flash: often enough, and the near more than the far.
 
-    A flash takes light from nothing. Where a strong one makes the middle nearly white its gain is cut off, and
-    is not compared with that of the corners.
+    A flash darkens nothing. Where a strong one makes the middle nearly white its gain is cut off, and is not
+    compared with that of the corners.
     """
     changes = np.count_nonzero(np.diff(model.lit.astype(int)))
     near, far = model.gain[0], model.gain[-1]
