@@ -1,11 +1,15 @@
 """The plane of a head is found to a degree and a millimetre; what has none or many is told apart."""
 
+import os
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from face_shapes import arc_of_cameras, rotation, seen_by, shape, sitter, spoiled
 
+from capture.ply import read_ply
+from capture.transfer import to_linear
 from relight.face.frame import head_frame
 from relight.face.head import find_head
 from relight.face.head_part import head_floor
@@ -147,3 +151,21 @@ def test_a_plane_reflects_twice_into_the_same():
 def test_a_plane_without_a_normal_is_refused():
     with pytest.raises(ValueError, match="zero"):
         Plane.of(np.zeros(3), 1.0)
+
+
+def test_the_plane_of_a_scanned_head_passes_through_nose_mouth_and_chin():
+    root = Path(__file__).parents[3]
+    folder = Path(os.environ.get("RELIGHT_PORTRAIT_A", root.parent / "shared" / "portrait_A"))
+    if not (folder / "gt" / "surface.ply").is_file():
+        pytest.skip("portrait_A is not here; set RELIGHT_PORTRAIT_A to its folder")
+    cloud = read_ply(folder / "gt" / "surface.ply")
+    some = slice(None, None, 5)
+    exact = (cloud.points[some], cloud.normals[some], to_linear(cloud.colors[some], "srgb"))
+    cameras = arc_of_cameras(-35, 85)
+    head = find_head(*spoiled(seen_by([np.asarray(v, float) for v in exact], cameras)), cameras)
+    assert head.decision.found
+    # The scan is turned: the whole, exact surface gives this plane, which its picture confirms.
+    truth = Plane.of(np.array([0.99969, -0.0040, 0.0247]), -0.00425)
+    assert np.degrees(head.frame.plane.angle_to(truth)) < 1.5
+    middle = np.array([0.0, 0.0, 0.04]) - truth.distance(np.array([0.0, 0.0, 0.04])) * truth.n
+    assert abs(head.frame.plane.distance(middle)) < 0.002
