@@ -129,7 +129,7 @@ def make_camera():
 @pytest.fixture
 def found_from(tmp_path, monkeypatch):
     """`find_poses` on looks instead of pictures."""
-    from relight.sfm import SfmConfig, find, find_poses
+    from relight.sfm import SfmConfig, find, find_poses, search
 
     def run(looks, refused=None, rotation_deg=0, **settings):
         session = Session.create(
@@ -139,13 +139,16 @@ def found_from(tmp_path, monkeypatch):
             height=SIZE[1],
             rotation_deg=rotation_deg,
         )
+        if settings.pop("ways", 1) == 1:  # the ladder repeats itself where features are given
+            ladder = find._ladder
+            monkeypatch.setattr(find, "_ladder", lambda config: ladder(config)[:1])
         if settings.pop("calibrated", True):
             from calib.calibration import Calibration, Intrinsics, save_calibration
             from capture.calibration_file import Quantity
 
             pinhole = Quantity.of([FOCAL_PX, FOCAL_PX, SIZE[0] / 2, SIZE[1] / 2], "px", "test")
             save_calibration(Calibration(intrinsics=Intrinsics(*SIZE, pinhole)), session.calibration_path)
-        monkeypatch.setattr(find, "survey", lambda *_: (list(looks), dict(refused or {})))
+        monkeypatch.setattr(search, "survey", lambda *_: (list(looks), dict(refused or {})))
         records = [look.record for look in looks]
         records += [replace(records[0], index=index, file=None) for index in refused or {}]
         session.finish()
