@@ -12,7 +12,7 @@ Inverse depths are counted in labels: pixels of parallax in the source that move
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 
@@ -24,6 +24,7 @@ from relight.stereo.semiglobal import regularised
 from relight.stereo.thin_plate import smoothed
 from relight.stereo.windows import Window, parallax_px, region_window, transferred
 
+_COARSE_PX = 96  # side of the window at the coarse resolution, at least
 _FARTHEST = 50.0  # times the distance of the head: infinity
 _FULL_CONFIDENCE = 0.3  # curvature of the cost, per pixel of parallax squared, that counts as usual
 _MOST_CONFIDENCE = 4.0
@@ -138,7 +139,8 @@ def estimate_depth(
         region: What is looked for.
         scale: Of the fine resolution, relative to the pictures.
     """
-    level = _Level(frames, index, sources[0], region, scale, COARSE)
+    coarse = replace(COARSE, scale=_coarse_scale(frames.cameras[index].scaled(scale), region))
+    level = _Level(frames, index, sources[0], region, scale, coarse)
     distance = level.window.distance
     # Farther ones would be before the camera: nearest is what the region begins with.
     nearest = 1.0 / max(distance - region.radius, 0.1 * distance)
@@ -155,6 +157,13 @@ def estimate_depth(
         inverse_depth, weight = _about(level, base)
         window, camera = level.window, level.camera
     return DepthMap(index, camera, window, inverse_depth, weight)
+
+
+def _coarse_scale(camera: Camera, region: HeadRegion) -> float:
+    """A quarter, or as much more as a small picture needs to keep its pattern."""
+    window = region_window(camera, region)
+    side = max(window.width, window.height) if window is not None else 1
+    return float(min(MIDDLE.scale, max(COARSE.scale, _COARSE_PX / side)))
 
 
 def estimate_about(

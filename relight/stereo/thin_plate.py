@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import torch
 
-_GRADUATION = 6.0
+_GRADUATION = 3.0
 
 
 def smoothed(

@@ -14,7 +14,7 @@ from capture.session import Session
 RADIUS = 0.1
 DISTANCE = 0.5
 WALL_Z = -0.6
-SIZE = 96
+SIZE = 128
 
 
 def camera_at(azimuth_deg: float, name: str, size: int = SIZE) -> Camera:
