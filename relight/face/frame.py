@@ -26,6 +26,7 @@ _FEWEST_LEVELS = 3
 _LONGEST = 0.24  # breadths that a nose may stand out; what does more has a neck beside it and is a chin
 _BEHIND = 0.1  # breadths that a tip may lie behind the foremost point: of a chin, where the head is tilted
 _FEWEST = 3
+_MOST_LEVELS = 400
 
 
 @dataclass(frozen=True)
@@ -102,7 +103,7 @@ def _breadth(side: Floats) -> float:
     reach = [
         float(np.percentile(side[side * sign > 0] * sign, 97)) for sign in (-1, 1) if (side * sign > 0).any()
     ]
-    return 2.0 * max(reach)
+    return max(2.0 * max(reach, default=0.0), 1e-9)  # a sheet in the plane has none
 
 
 def _profile(side: Floats, heights: Floats, depths: Floats, breadth: float) -> tuple[Floats, Floats, Floats]:
@@ -110,8 +111,8 @@ def _profile(side: Floats, heights: Floats, depths: Floats, breadth: float) -> t
 
     NaN where a level has no middle or nothing beside it.
     """
-    low, high = float(heights.min()), float(heights.max())
-    count = max(1, int((high - low) / (_LEVEL * breadth)))
+    low, high = (float(heights.min()), float(heights.max())) if len(heights) else (0.0, 0.0)
+    count = int(np.clip((high - low) / (_LEVEL * breadth), 1, _MOST_LEVELS))
     levels = low + (np.arange(count) + 0.5) * (high - low) / count
     middle, beside = np.full(count, np.nan), np.full(count, np.nan)
     reach = np.abs(side) / breadth
@@ -133,12 +134,12 @@ def _profile(side: Floats, heights: Floats, depths: Floats, breadth: float) -> t
 def _nose(levels: Floats, protrusion: Floats, middle: Floats, breadth: float) -> tuple[float, float, float]:
     """Height and depth of the tip, and how far it stands out over what the levels about the nose do."""
     known = np.isfinite(protrusion)
-    best = (float(np.median(levels)), float(np.nan_to_num(np.nanmax(middle), nan=0.0)), 0.0)
+    foremost = float(middle[np.isfinite(middle)].max(initial=-np.inf))
+    best = (float(np.median(levels)), foremost if np.isfinite(foremost) else 0.0, 0.0)
     if known.sum() < 5:
         return best
     reach = (levels[known, None] - levels[known]) / breadth  # [others, tip]
     stands = protrusion[known]
-    foremost = float(np.nanmax(middle))
     for k, (at, height) in enumerate(zip(np.flatnonzero(known), stands, strict=True)):
         if foremost - middle[at] > _BEHIND * breadth or height > _LONGEST:
             continue

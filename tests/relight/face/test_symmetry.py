@@ -169,3 +169,21 @@ def test_the_plane_of_a_scanned_head_passes_through_nose_mouth_and_chin():
     assert np.degrees(head.frame.plane.angle_to(truth)) < 1.5
     middle = np.array([0.0, 0.0, 0.04]) - truth.distance(np.array([0.0, 0.0, 0.04])) * truth.n
     assert abs(head.frame.plane.distance(middle)) < 0.002
+
+
+@pytest.mark.parametrize("kind", ["sheet", "line", "noise", "two balls", "speck"])
+def test_degenerate_clouds_end_in_a_decision(kind, half_circle):
+    random = np.random.default_rng(0)
+    points, normals = random.normal(size=(3000, 3)), random.normal(size=(3000, 3))
+    if kind == "sheet":
+        points, normals = points * [0.1, 0.1, 0.0], np.tile([0.0, 0.0, 1.0], (3000, 1))
+    elif kind == "line":
+        points, normals = points * [0.0, 0.1, 0.0], np.tile([0.0, 0.0, -1.0], (3000, 1))
+    elif kind == "two balls":
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        points = 0.05 * normals + np.where(points[:, :1] > 0, 0.2, -0.2) * [1.0, 0.0, 0.0]
+    elif kind == "speck":
+        points *= 1e-9
+    head = find_head(points, normals, None, half_circle)
+    assert head.decision.found is False
+    assert head.decision.reason
