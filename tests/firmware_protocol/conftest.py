@@ -174,7 +174,7 @@ def build(directory, *targets, **variables):
 def _make(directory, *targets, **variables):
     settings = [f"{name}={value}" for name, value in variables.items()]
     made = subprocess.run(
-        ["make", "-C", FIRMWARE, f"BUILD={directory}", *targets, *settings],
+        ["make", "-C", FIRMWARE, f"BUILD={directory}", "STRICT=-Werror", *targets, *settings],
         capture_output=True,
         text=True,
         check=False,

@@ -354,6 +354,13 @@ def test_line_errors_are_counted(flash):
     assert (answer.crc_errors, answer.framing_errors) == (1, 3)
 
 
+def test_a_delimiter_is_heard_after_more_noise_than_the_device_can_hold(flash):
+    flash.ready()
+    flash.write(b"\x55" * 1000 + b"\0" + encode(Ping(1), 9))
+    flash.run(0.2)
+    assert [type(packet.message) for packet in flash.take() if packet.seq == 9] == [Pong]
+
+
 def test_a_person_at_a_terminal_gets_a_banner(flash):
     flash.ready()
     for typed in (b"?\n", b"?\r\n"):

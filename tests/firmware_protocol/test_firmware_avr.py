@@ -50,6 +50,30 @@ def test_the_shortest_pulse_is_not_a_long_one(avr):
         assert width < 20e-6
 
 
+@pytest.mark.parametrize("after_beat", range(1, 5))
+def test_a_short_pulse_that_begins_within_another_interrupt_is_not_missed(avr, after_beat):
+    """The main loop's beat is each 2,500 ticks; its interrupt holds up the one that sets the pulse's end."""
+    avr.ready()
+    for on_us in (4, 8, 12, 16):
+        t0 = -(-avr.tick_in(0.1) // 2500) * 2500 + after_beat
+        avr.ask(Train(avr.nonce, t0, 500_000, on_us, 2, FULL_LEVEL))
+        avr.keep_alive(1.5)
+    assert len(avr.pulses()) == 8
+    assert all(width < 60e-6 for _, width in avr.pulses())
+
+
+@pytest.mark.parametrize("low_half", [0, 1, 0xFFFE, 0xFFFF])
+def test_an_edge_at_the_overflow_of_the_timer_has_the_right_tick(avr, low_half):
+    avr.ready()
+    t0 = (avr.tick_in(0.1) // 0x10000 + 1) * 0x10000 + low_half
+    avr.ask(Train(avr.nonce, t0, 1_000_000, 0x10000 * 4 - 20_000, 1, FULL_LEVEL))
+    avr.keep_alive(1)
+    on, off = (packet.message.tick for packet in avr.take(Event))
+    assert (on, off - on) == (t0, 0x10000 - 5000)
+    ((_, width),) = avr.pulses()
+    assert width == pytest.approx((0x10000 - 5000) * TICK_S, abs=INSTRUCTION_S)
+
+
 def test_the_highest_rate_has_an_error_of_less_than_a_tick(avr):
     pulses = pulse_train(avr, MIN_PERIOD_US, 250_000, 15)
     for k, (start, width) in enumerate(pulses):

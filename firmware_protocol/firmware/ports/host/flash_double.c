@@ -52,7 +52,7 @@ static void write_line(uint8_t byte)
 /* Returns how many bytes. */
 static size_t read_line(void)
 {
-    uint8_t bytes[256];
+    uint8_t bytes[4096];
     ssize_t count = read(line_fd, bytes, sizeof bytes);
     if (count <= 0)
         return 0;
