@@ -28,10 +28,10 @@ Grey = NDArray[np.uint8]
 # markers of a board that is near enough to calibrate with are tens of pixels even then.
 _SEARCHED_SIDE = 1280
 _FEWEST_MARKERS, _FEWEST_CORNERS = 4, 8
-# A marker is in its place within this share of its side: a lens bends a board by less, and a marker of
-# another arrangement is a whole square away.
-_IN_PLACE_SHARE = 0.3
-_IN_PLACE_MARKERS = 0.75  # share of the markers found; one or two false ones among many are left out
+# Neighbouring markers (up to this many squares apart) lie where one says the other should be, to within this
+# share of a square; of a board that is recognised nearly all do, of one with rows shifted about half.
+_NEIGHBOUR_SQUARES, _IN_PLACE_SHARE = 2.1, 0.5
+_AGREEING_PAIRS = 0.75
 # An edge over this share of a square (and this many pixels) is no corner's any more: the refinement then sees
 # the markers' edges. A sharp edge is 1.5 to 2.5 px wide.
 _BLURRED_SHARE, _BLURRED_PX = 0.2, 3.0
@@ -133,7 +133,11 @@ class BoardDetector:
         if np.linalg.svd(places - places.mean(0), compute_uv=False)[1] < self.board.square_m:
             return Failure(Problem.PARTIAL, candidates)
         opencv_px = _refined(
-            grey, self._boards[layout], found, np.asarray(corners, np.float32).reshape(-1, 2)[order]
+            grey,
+            self._boards[layout],
+            found,
+            np.asarray(corners, np.float32).reshape(-1, 2)[order],
+            (markers[in_place], ids[in_place]),
         )
         width_px, square_px = _edge_width(grey, self.board, found, opencv_px)
         if width_px > max(_BLURRED_PX, _BLURRED_SHARE * square_px):
@@ -173,12 +177,12 @@ class BoardDetector:
         self, markers: NDArray[np.float32], ids: NDArray[np.int32]
     ) -> tuple[str | None, NDArray[np.bool_]]:
         """The layout in which the markers lie where they should, and which of them do."""
-        best, best_in_place = None, np.zeros(len(ids), bool)
+        best, best_share, best_in_place = None, 0.0, np.zeros(len(ids), bool)
         for name, board in self._boards.items():
-            in_place = _in_place(board.marker_corners_m, markers, ids)
-            if in_place.sum() > best_in_place.sum():
-                best, best_in_place = name, in_place
-        enough = best_in_place.sum() >= max(_FEWEST_MARKERS, _IN_PLACE_MARKERS * len(ids))
+            share, in_place = _in_place(board, markers, ids)
+            if share > best_share:
+                best, best_share, best_in_place = name, share, in_place
+        enough = best_share >= _AGREEING_PAIRS and best_in_place.sum() >= _FEWEST_MARKERS
         return (best if enough else None), best_in_place
 
 
@@ -199,37 +203,57 @@ def _find_markers(detector: Any, grey: Grey) -> tuple[NDArray[np.float32], NDArr
 
 
 def _in_place(
-    expected_m: NDArray[np.float64], markers: NDArray[np.float32], ids: NDArray[np.int32]
-) -> NDArray[np.bool_]:
-    """[m] which markers lie, by one homography of the board, where the board has them."""
-    known = ids < len(expected_m)
-    result = np.zeros(len(ids), bool)
-    if known.sum() < _FEWEST_MARKERS:
-        return result
-    seen = markers[known].astype(np.float64)
-    side_px = np.linalg.norm(seen - np.roll(seen, 1, axis=1), axis=2).mean(1)
-    tolerance_px = _IN_PLACE_SHARE * float(np.median(side_px))
-    cv2.setRNGSeed(0)
-    px_from_board, _ = cv2.findHomography(
-        expected_m[ids[known]].reshape(-1, 2), seen.reshape(-1, 2), cv2.RANSAC, tolerance_px
-    )
-    if px_from_board is None:
-        return result
-    predicted = cv2.perspectiveTransform(expected_m[ids[known]].reshape(-1, 1, 2), px_from_board)
-    off_px = np.linalg.norm(predicted.reshape(seen.shape) - seen, axis=2).max(1)
-    result[known] = off_px <= np.maximum(_IN_PLACE_SHARE * side_px, tolerance_px)
-    return result
+    board: Board, markers: NDArray[np.float32], ids: NDArray[np.int32]
+) -> tuple[float, NDArray[np.bool_]]:
+    """Share of neighbouring markers that lie to each other as on the board, and [m] which markers do.
+
+    Each marker's own corners say where its neighbours should be. Over so short a way neither the lens nor
+    perspective bend much, and a marker of another arrangement is a whole square off.
+    """
+    expected_m = board.marker_corners_m
+    in_place = np.zeros(len(ids), bool)
+    known = np.nonzero(ids < len(expected_m))[0]
+    if len(known) < _FEWEST_MARKERS:
+        return 0.0, in_place
+    plan, seen = expected_m[ids[known]], markers[known].astype(np.float64)
+    plan_middle, seen_middle = plan.mean(1), seen.mean(1)
+    # Affine map of each marker, by least squares over its corners: those of a square are orthogonal.
+    offsets = plan - plan_middle[:, None]
+    px_per_m = np.einsum("mci,mcj->mij", seen - seen_middle[:, None], offsets) / board.marker_m**2
+    way_m = plan_middle[None] - plan_middle[:, None]
+    predicted = seen_middle[:, None] + np.einsum("aij,abj->abi", px_per_m, way_m)
+    off_px = np.linalg.norm(predicted - seen_middle[None], axis=2)
+    side_px = np.sqrt(np.abs(np.linalg.det(px_per_m))) * board.square_m
+    agrees = off_px < _IN_PLACE_SHARE * side_px[:, None]
+    agrees |= agrees.T
+    near = np.linalg.norm(way_m, axis=2) < _NEIGHBOUR_SQUARES * board.square_m
+    np.fill_diagonal(near, False)
+    if not near.any():
+        return 0.0, in_place
+    votes = (agrees & near).sum(1) / np.maximum(near.sum(1), 1)
+    in_place[known] = votes > 0.5
+    # A false marker among true ones disagrees with all; it should not cost the board its name.
+    sound = near & in_place[known][:, None] & in_place[known]
+    share = float((agrees & sound).sum() / max(sound.sum(), 1)) * float(in_place.sum() / len(ids))
+    return share, in_place
 
 
 def _refined(
-    grey: Grey, board: Board, ids: NDArray[np.int64], opencv_px: NDArray[np.float32]
+    grey: Grey,
+    board: Board,
+    ids: NDArray[np.int64],
+    opencv_px: NDArray[np.float32],
+    markers: tuple[NDArray[np.float32], NDArray[np.int32]],
 ) -> NDArray[np.float64]:
     """[n, 2] corners to where the edges around them meet, in the largest window without a marker in it."""
     px_from_board, _ = cv2.findHomography(board.corners_m[ids, :2], opencv_px.astype(np.float64), 0)
-    markers = board.marker_corners_m.reshape(-1, 1, 2)
-    off_m = np.linalg.norm(markers[:, 0] - board.corners_m[ids, None, :2], axis=2)
-    nearest = markers[np.argsort(off_m, axis=1)[:, :4]].reshape(-1, 1, 2)  # up to two markers touch a corner
-    there = cv2.perspectiveTransform(nearest, px_from_board).reshape(len(ids), 4, 2)
+    flat_m = board.marker_corners_m.reshape(-1, 2)
+    # Where they were not found, markers are where a homography puts them.
+    marker_px = cv2.perspectiveTransform(flat_m[:, None], px_from_board).reshape(-1, 4, 2)
+    marker_px[markers[1]] = markers[0]
+    off_m = np.linalg.norm(flat_m - board.corners_m[ids, None, :2], axis=2)
+    nearest = np.argsort(off_m, axis=1, kind="stable")[:, :2]  # two markers touch a corner, or one
+    there = marker_px.reshape(-1, 2)[nearest]
     # The window is a square: its own corners are what comes nearest. An edge's blur is another pixel.
     distance = np.linalg.norm(there - opencv_px[:, None], axis=2).min(1)
     reach = np.clip(((distance - 1.0) / np.sqrt(2.0)).astype(int), *_WINDOW_PX)

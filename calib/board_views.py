@@ -19,6 +19,11 @@ from calib.view_selection import ViewShelf
 Progress = Callable[[str, float], None]
 
 _EXAMINED = 3  # refused pictures kept for a closer look, those with the most that could be markers
+_LAYOUT_WORDS = {
+    "current": "layout of OpenCV since 4.6",
+    "legacy": "legacy layout (before OpenCV 4.6, calib.io)",
+    "both": "layout that is the same before and since OpenCV 4.6",
+}
 _ADVICE = {
     Problem.NO_BOARD: "fill half of the picture with the board, lit evenly and without reflections, and "
     "check that it is the board described",
@@ -54,6 +59,7 @@ class CollectedViews:
         parts = [f"{self.searched} pictures searched", f"{len(self.views)} views used"]
         if self.repeated:
             parts.append(f"{self.repeated} of a pose that was seen already")
+        parts += [f"{count} in the {_LAYOUT_WORDS[name]}" for name, count in self.layouts.most_common()]
         parts += [f"{count} where {problem.value}" for problem, count in self.problems.most_common()]
         return ", ".join(parts)
 
@@ -70,7 +76,7 @@ def collect_views(
         IntrinsicsError: too few; the message says what is wrong with most of them.
     """
     detector = BoardDetector(board)
-    shelf = ViewShelf(board, capacity)
+    shelf = ViewShelf(board, max(capacity, FEWEST_VIEWS))
     collected = CollectedViews([])
     refused: list[tuple[int, Problem, str, NDArray[np.uint8]]] = []
     for picture in pictures:

@@ -28,12 +28,13 @@ def test_corners_of_a_rendered_board_are_where_the_lens_puts_them(pictures, boar
 
 @pytest.mark.parametrize("layout", ["current", "legacy"])
 @pytest.mark.parametrize("described", ["current", "legacy"])
-def test_the_layout_is_found_whatever_the_description_says(render_board, layout, described):
-    board = Board((5, 6), 0.03, 0.022)
+@pytest.mark.parametrize("squares", [(5, 6), (6, 6)])
+def test_the_layout_is_found_whatever_the_description_says(render_board, layout, described, squares):
+    board = Board(squares, 0.03, 0.022)
     picture = render_board(board.with_layout(layout), pose())
     view = BoardDetector(board.with_layout(described)).look(picture, "picture")
     assert view.layout == layout
-    assert len(view.ids) == 20
+    assert len(view.ids) == (squares[0] - 1) * (squares[1] - 1)
 
 
 def test_a_turned_picture_shows_the_same_corners(pictures, board):
