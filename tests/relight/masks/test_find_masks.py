@@ -5,6 +5,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+import torch
 
 from capture.images import write_png
 from capture.session import Session
@@ -84,14 +85,23 @@ def test_frames_kept_for_validation_are_not_read(scene, tmp_path):
     ]
 
 
-def test_the_same_input_gives_the_same_files(film, scene, tmp_path):
+@pytest.fixture
+def threads():
+    """Sets torch's threads, and sets them back."""
+    before = torch.get_num_threads()
+    yield torch.set_num_threads
+    torch.set_num_threads(before)
+
+
+def test_the_same_input_gives_the_same_files_on_any_number_of_threads(film, scene, tmp_path, threads):
     points = scene.cloud()
     config = MaskConfig(working_px=96, rounds=1)
     few = {index: film.cameras[index] for index in (0, 1, 2)}
-    for name in ("a", "b"):
-        find_masks(film.session, few, points, None, tmp_path / name, config)
-    for path in (tmp_path / "a").iterdir():
-        assert path.read_bytes() == (tmp_path / "b" / path.name).read_bytes()
+    for count in (1, 2):
+        threads(count)
+        find_masks(film.session, few, points, None, tmp_path / str(count), config)
+    for path in (tmp_path / "1").iterdir():
+        assert path.read_bytes() == (tmp_path / "2" / path.name).read_bytes()
 
 
 def test_a_cloud_of_nothing_is_refused(film, tmp_path):
