@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -122,17 +122,15 @@ class _Work:
             maps.append(checked(depth, self.region))
             done += 1
             progress("stereo", 0.9 * done / total)
-        found = self._agreements(maps)
         if config.second_pass:
             again: list[CheckedMap] = []
-            for own, agreement in zip(maps, found, strict=True):
+            for own, agreement in zip(maps, self._agreements(maps), strict=True):
                 depth = self._once_more(own, agreement, self._sources(own.depth.index, group, 2), scale)
                 again.append(checked(depth, self.region))
                 done += 1
                 progress("stereo", 0.9 * done / total)
             maps = again
-            found = self._agreements(maps)
-        return self._fused(maps, found, scale)
+        return self._fused(maps, scale)
 
     def _group(self) -> list[int]:
         """The frames to compare with each other: the kind that covers the path better, unlit if in doubt."""
@@ -186,15 +184,14 @@ class _Work:
         )
         return {other: pair_gain(self.frames, index, other, self.sparse) for other in chosen}
 
-    def _agreements(self, maps: Sequence[CheckedMap]) -> list[Agreement]:
+    def _agreements(self, maps: Sequence[CheckedMap]) -> Iterator[Agreement]:
+        """One after the other: together they would take more memory than the maps."""
         directions = directions_from(self.region.centre_world, [m.depth.camera for m in maps])
         angles = np.degrees(np.arccos(np.clip(directions @ directions.T, -1.0, 1.0)))
-        found = []
         for place, own in enumerate(maps):
             order = [int(j) for j in np.argsort(angles[place]) if j != place]
             near = [j for j in order if angles[place, j] < _NEIGHBOUR_DEG][: self.config.neighbours]
-            found.append(agree(own, [maps[j] for j in near], self.config.depth_tolerance))
-        return found
+            yield agree(own, [maps[j] for j in near], self.config.depth_tolerance)
 
     def _once_more(
         self, own: CheckedMap, agreement: Agreement, sources: Mapping[int, float], scale: float
@@ -219,10 +216,10 @@ class _Work:
             agreement.against <= _MOST_AGAINST * agreement.support
         )
 
-    def _fused(self, maps: Sequence[CheckedMap], found: Sequence[Agreement], scale: float) -> DenseCloud:
+    def _fused(self, maps: Sequence[CheckedMap], scale: float) -> DenseCloud:
         points, normals, weights, shares = [], [], [], []
         in_region, kept = 0, 0
-        for own, agreement in zip(maps, found, strict=True):
+        for own, agreement in zip(maps, self._agreements(maps), strict=True):
             good = self._good(agreement)
             points.append(agreement.points[good])
             normals.append(agreement.normals[good])

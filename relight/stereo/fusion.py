@@ -13,6 +13,7 @@ from relight.stereo.depth import DepthMap
 _EDGE_PX = 3  # windows reach over an edge of the surface by their radius
 _STEP = 6.0  # depth between neighbouring pixels, in widths of a pixel, that is an edge: 80 degrees of slant
 _GRAZING = 0.12  # cosine
+_CHUNK = 1 << 18  # points at a time where float64 copies are made
 _SLANTED = 3.0  # tolerances by which depths may differ where the surfaces do not
 _SEES_THROUGH = 3.0  # tolerances by which a point lies before what another map sees
 
@@ -122,8 +123,10 @@ def one_a_cell(
     key = (lattice[:, 0] * sides[1] + lattice[:, 1]) * sides[2] + lattice[:, 2]
     _, member, counts = torch.unique(key, return_inverse=True, return_counts=True)
     sums = points.new_zeros(len(counts), 7, dtype=torch.float64)
-    values = torch.cat([points, normals, torch.ones_like(points[:, :1])], dim=1).double()
-    sums.index_add_(0, member, values * weight[:, None])
+    for start in range(0, len(points), _CHUNK):
+        part = slice(start, start + _CHUNK)
+        values = torch.cat([points[part], normals[part], torch.ones_like(points[part, :1])], dim=1)
+        sums.index_add_(0, member[part], values.double() * weight[part, None])
     means = sums[:, :6] / sums[:, 6:].clamp(min=1e-30)
     directions = torch.nn.functional.normalize(means[:, 3:], dim=1)
     return means[:, :3].float(), directions.float(), member, counts
