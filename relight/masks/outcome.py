@@ -168,7 +168,7 @@ def warnings(
 
 
 def _flash_warnings(separations: Sequence[float], flashes: Sequence[int | None]) -> list[str]:
-    alone = "the masks come from the cloud's outline and the colours alone"
+    alone = "the masks come from the cloud's outline, parallax and colours"
     for flash, name in ((1, "lit"), (0, "unlit")):
         if flash not in flashes:
             return [f"No frame is {name}, so the flash cannot tell the head from the room; {alone}."]
