@@ -71,7 +71,10 @@ def follow_the_head(search: Search, way: Way) -> tuple[Outcome, dict[str, Any], 
     parted = min(on, off) < _PARTED * max(on, off)
     if not parted and outcome.usable:
         return outcome, about, ()
-    alone, about_alone = solve(search, way, subject)
+    # With the lens that everything gave: a short arc of the head alone does not tell the focal length, and
+    # the two could not be compared.
+    comparable = outcome.usable and len(outcome.cameras) == len({look.size for look in mapped})
+    alone, about_alone = solve(search, way, subject, outcome.cameras if comparable else None)
     about |= {"alone": about_alone}
     if (
         alone.sparse is None
@@ -87,6 +90,10 @@ def follow_the_head(search: Search, way: Way) -> tuple[Outcome, dict[str, Any], 
         return outcome, about, ()
     if outcome.usable and same_motion(whole, alone.sparse):
         return outcome, about, ()
+    if comparable:
+        freed, about_alone = solve(search, way, subject)
+        if freed.usable and freed.registered >= alone.registered:
+            alone, about["alone"] = freed, about_alone
     warning = "The head moves against the background: only features on the head were used."
     return alone, about | {"features_of": "subject"}, (warning,)
 

@@ -74,7 +74,7 @@ def find_poses(
         config.threads or (os.cpu_count() or 1),
         progress,
     )
-    started_s = time.perf_counter()
+    started_s, started_cpu_s = time.perf_counter(), time.process_time()
     outcomes: list[tuple[Way, Outcome, dict[str, Any], tuple[str, ...]]] = []
     for way in _ladder(config):
         outcome, about, warnings = follow_the_head(search, way)
@@ -91,6 +91,7 @@ def find_poses(
     if search.prepared != (best[0].recipe, best[0].wide):
         prepare(search, best[0])  # features are numbered anew in each way
     search.seconds["all"] = time.perf_counter() - started_s
+    search.seconds["processor"] = time.process_time() - started_cpu_s
     attempts = [{"way": way.name} | about for way, _, about, _ in outcomes]
     result = make_result(
         session.info["image"].get("rotation_deg", 0),

@@ -60,6 +60,8 @@ def map_frames(
         threads: -1 = all cores.
         seed: Of its random draws.
     """
+    if sum(pair.verified for pair in pairs) < LEAST_FRAMES - 1:
+        return []
     with tempfile.TemporaryDirectory(prefix="poses-") as folder, quiet_colmap():
         path = Path(folder) / "database.db"
         _write_database(path, looks, cameras, pairs)

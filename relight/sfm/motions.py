@@ -15,7 +15,7 @@ from relight.sfm.survey import Look
 _FAR = 5  # frames apart in the order of capture
 _STILL = 0.002  # motion, share of the longer side: a pixel of 512
 _MOVING = 0.008
-_LEAST_SHARE = 0.15  # of a pair's matches, still and moving
+_LEAST_STILL, _LEAST_MOVING = 0.15, 0.05  # of a pair's matches
 _LEAST_MATCHES = 10
 _LEAST_PAIRS = 0.5  # share of the far pairs
 _ASKED = 60  # far pairs of which each side's motion is found
@@ -43,8 +43,8 @@ def still_features(looks: Sequence[Look], pairs: Sequence[Pair]) -> list[NDArray
         motion = _motion(looks, pair)
         still, moving = motion < _STILL, motion > _MOVING
         far += 1
-        most = max(_LEAST_MATCHES, _LEAST_SHARE * len(motion))
-        both += int(still.sum() >= most and moving.sum() >= most)
+        enough_still = still.sum() >= max(_LEAST_MATCHES, _LEAST_STILL * len(motion))
+        both += int(enough_still and moving.sum() >= max(_LEAST_MATCHES, _LEAST_MOVING * len(motion)))
         flags[pair.first][pair.matches[still, 0]] = True
         flags[pair.second][pair.matches[still, 1]] = True
     if not far or both < _LEAST_PAIRS * far:

@@ -17,6 +17,8 @@ from relight.sfm.sparse import Sparse
 from relight.sfm.survey import Look
 from relight.sfm.world import TYPICAL_DISTANCE, canonical_world
 
+_ENOUGH_FAN_DEG = 30.0  # an arc of 12 degrees left an unknown focal length 2 % wrong
+
 
 def make_result(
     rotation_deg: int,
@@ -80,7 +82,10 @@ def make_result(
         metric=unit is not None,
         scale_source=source,
         report=report,
-        warnings=_size_warning(unit is not None, config, board),
+        warnings=(
+            *_size_warning(unit is not None, config, board),
+            *_lens_warning(outcome, lenses),
+        ),
     )
 
 
@@ -89,6 +94,18 @@ def _size_warning(metric: bool, config: SfmConfig, board: Board | None) -> tuple
         return ()
     what = "The ChArUco board was" if board is not None else "Markers of the stated size were"
     return (f"{what} not seen in enough frames to give the unit; the poses have none.",)
+
+
+def _lens_warning(outcome: Outcome, lenses: Mapping[tuple[int, int], Lens]) -> tuple[str, ...]:
+    if outcome.assessment is None or all(lens.known for lens in lenses.values()):
+        return ()
+    fan = outcome.assessment.numbers["fan_deg"]
+    if fan >= _ENOUGH_FAN_DEG:
+        return ()
+    return (
+        f"The cameras fan over {fan:.0f} degrees only, from which the focal length is not well known "
+        f"(good from {_ENOUGH_FAN_DEG:.0f}); calibrate the camera, or walk farther around the head.",
+    )
 
 
 def _corners(sparse: Sparse, mapped: Sequence[Look]) -> dict[int, NDArray[np.float64]]:

@@ -18,10 +18,11 @@ BLURRED = 0.6
 """Sharpness relative to the neighbours' median below which a frame is blurred."""
 
 SAME_PLACE = 0.004
-"""Median motion of the features, share of the longer side, below which two frames are from the same place."""
+"""Motion, share of the longer side, below which a feature is in the same place."""
 
 _NEIGHBOURS = 6  # on each side
-_STRONGEST = 500  # features that are enough to see whether anything moved
+_STRONGEST = 1000  # features that are enough to see whether anything moved
+_STILL = 0.94  # share of the matches; of frames from one place fewer than this are wrong
 _ENOUGH = 40  # matches
 _MOST_BLURRED = 0.3  # share of the frames; more than this is no blur but a change of what is seen
 
@@ -46,8 +47,8 @@ def same_place(first: Look, second: Look) -> bool:
     if len(matches) < _ENOUGH:
         return False
     motion = np.linalg.norm(a.places_px[matches[:, 0]] - b.places_px[matches[:, 1]], axis=1)
-    # The upper quartile: a still background must not hide a head that turned.
-    return float(np.percentile(motion, 75.0)) < SAME_PLACE * max(first.size)
+    # Nearly all must be still: the many features of a still background must not hide a head that turned.
+    return float(np.percentile(motion, 100.0 * _STILL)) < SAME_PLACE * max(first.size)
 
 
 def choose_keyframes(looks: Sequence[Look], most: int) -> tuple[list[int], dict[int, str]]:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -110,7 +111,10 @@ def prepare(search: Search, way: Way) -> None:
 
 
 def solve(
-    search: Search, way: Way, keep: Sequence[NDArray[np.bool_]] | None
+    search: Search,
+    way: Way,
+    keep: Sequence[NDArray[np.bool_]] | None,
+    lens: Mapping[tuple[int, int], pycolmap.Camera] | None = None,
 ) -> tuple[Outcome, dict[str, Any]]:
     """One reconstruction from what `prepare` left, and numbers about it for the report.
 
@@ -118,16 +122,20 @@ def solve(
         search: Its features and matches.
         way: How to map.
         keep: For each keyframe [N] bool, the features to use; None = all.
+        lens: COLMAP's cameras by size, to be held fixed; None = as the session knows them.
     """
     mapped, config = search.mapped, search.config
     since_s = time.perf_counter()
-    known = all(lens.known for lens in search.lenses.values())
-    refine = not known or config.refine_intrinsics
+    known = lens is not None or all(start.known for start in search.lenses.values())
+    refine = not known or (config.refine_intrinsics and lens is None)
     cameras: dict[tuple[int, int], pycolmap.Camera] = {}
     for look in mapped:
-        if look.size not in cameras:
-            lens = search.lenses[look.record.width, look.record.height]
-            cameras[look.size] = colmap_camera(lens, look.size, refine, len(cameras) + 1)
+        if look.size not in cameras and lens is None:
+            start = search.lenses[look.record.width, look.record.height]
+            cameras[look.size] = colmap_camera(start, look.size, refine, len(cameras) + 1)
+        elif look.size not in cameras and lens is not None and look.size in lens:
+            cameras[look.size] = copy.deepcopy(lens[look.size])
+            cameras[look.size].has_prior_focal_length = True
     pairs = verify_pairs(mapped, cameras, search.pairs, keep, config, search.threads)
     since_s = _clock(search, "verification", since_s)
     search.progress(STAGE, 0.6)
