@@ -5,11 +5,12 @@ Times are simulated ones. A cycle is 62.5 ns; simavr may see a match up to an in
 
 import re
 import subprocess
+from itertools import pairwise
 from random import Random
 
 import pytest
 
-from firmware_protocol import Event, Set, Stat, Stop, Train
+from firmware_protocol import Event, Ping, Set, Stat, Stop, Train, encode
 from firmware_protocol.limits import FULL_LEVEL, HEARTBEAT_TIMEOUT_MS, MAX_ON_MS, MIN_PERIOD_US
 from firmware_protocol.messages import State
 
@@ -104,6 +105,31 @@ def test_the_stamps_of_a_pong_are_those_of_the_line(avr):
         # An interrupt and the reading of the clock take some microseconds; a frame's stuffing varies more.
         assert zero_s + pong.t2_tick * TICK_S == pytest.approx(heard_s[-1], abs=20e-6)
         assert zero_s + pong.t3_tick * TICK_S == pytest.approx(sent_s[0], abs=40e-6)
+
+
+def test_the_departure_of_a_pong_is_right_behind_other_answers_too(avr):
+    avr.ready()
+    avr.ask(Set(avr.nonce, FULL_LEVEL, 10))
+    avr.run(0.1)
+    zero_s = avr.edges[0][0] - avr.take(Event)[0].message.tick * TICK_S
+    for number in range(5):
+        avr.run(0.0317)
+        avr.take()
+        before = len(avr.sent_s)
+        avr.write(encode(Stop(), 1000 + number) + encode(Ping(number), 2000 + number))
+        avr.run(0.05)
+        stat, pong = (packet for packet in avr.take() if packet.seq)
+        assert isinstance(stat.message, Stat)
+        departed_s = avr.sent_s[before:][-len(encode(pong.message, pong.seq))]
+        assert zero_s + pong.message.t3_tick * TICK_S == pytest.approx(departed_s, abs=40e-6)
+
+
+def test_the_line_runs_at_the_rate_of_the_specification(avr):
+    """Ten bits a byte at 115,200 baud within the 2.5 % that a receiver forgives; simavr counts eleven."""
+    avr.run(1.2)
+    gaps = [b - a for a, b in pairwise(avr.sent_s[2:])]
+    assert max(gaps) < 100e-6
+    assert min(gaps) == pytest.approx(11 / 115_200, rel=0.025)
 
 
 @pytest.mark.parametrize("lit", [True, False])

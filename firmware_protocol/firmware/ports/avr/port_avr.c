@@ -125,13 +125,20 @@ static void log_edge(uint16_t at, bool on)
     edge->on = on;
 }
 
+/* A match that was made before, and whose interrupt is of no more use. (The flag is hardly ever up, as the
+ * interrupt is always on: simavr takes a write to this register for one to all of its flags.) */
+static void forget_match(void)
+{
+    if (TIFR1 & LAMP_MATCH)
+        TIFR1 = LAMP_MATCH;
+}
+
 /* The compare unit lets go of the pin, which is then low: its bit in PORTB is never set. */
 static void release_dark(void)
 {
     TCCR1A = 0;
     PORTB &= (uint8_t)~BOARD_LED;
-    TIMSK1 &= (uint8_t)~LAMP_INTERRUPT;
-    TIFR1 = LAMP_MATCH;
+    forget_match();
     lamp_pin.phase = DARK;
 }
 
@@ -175,9 +182,8 @@ static void arm_when_near(void)
     if (left > 0xFFFF)
         return;
     LAMP_OCR = left < NEAR_TICKS ? (uint16_t)(TCNT1 + SURE_TICKS) : (uint16_t)lamp_pin.on_tick;
-    TIFR1 = LAMP_MATCH;
+    forget_match();
     TCCR1A = SET_ON_MATCH;
-    TIMSK1 |= LAMP_INTERRUPT;
     lamp_pin.phase = ARMED;
 }
 
@@ -324,11 +330,11 @@ static void start_hardware(void)
     TCCR1A = 0;
     TCCR1B = _BV(CS11) | _BV(CS10); /* F_CPU / 64, counting round */
     BEAT_OCR = BEAT_TICKS;
-    TIMSK1 = _BV(TOIE1) | BEAT_INTERRUPT;
+    TIMSK1 = _BV(TOIE1) | BEAT_INTERRUPT | LAMP_INTERRUPT;
 
     /* 117,647 baud, 2.1 % above 115,200: what 16 MHz can do, and what the Arduino core does. */
-    UBRR0 = 16;
     UCSR0A = _BV(U2X0);
+    UBRR0 = 16;
     UCSR0C = _BV(UCSZ01) | _BV(UCSZ00);
     UCSR0B = _BV(RXCIE0) | _BV(RXEN0) | _BV(TXEN0);
 }
