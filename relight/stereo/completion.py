@@ -1,7 +1,7 @@
 """A cloud of stereo completed by the visual hull of masks, where stereo saw too little.
 
-A point of the hull is taken where there is no point of the cloud near, where it does not stand before what
-the cloud shows (the hull bridges hollows), and where cameras look at it, not only past it.
+A point of the hull is taken where there is no point of the cloud near, where it does not stand over
+or before what the cloud shows (the hull bridges hollows), and where cameras look at it, not only past it.
 """
 
 from __future__ import annotations
@@ -23,6 +23,8 @@ from relight.stereo.hull import VisualHull, visual_hull
 from relight.stereo.views import directions_from, spread_out
 
 _NEAR = 3.0  # spacings of the cloud within which it needs no completion
+_ABOVE = 0.6  # sine of the angle at which a point stands over the nearest of the cloud, not beside it
+_FAR = 25.0  # spacings from which on nearest points say nothing of that
 _FINER = 1.3  # spacings of the cloud between the points that are added
 _BEFORE = 6.0  # spacings by which a point may lie before the cloud
 _FACING = 0.12  # cosine to the cameras that look at a point
@@ -57,8 +59,11 @@ def completed(cloud: DenseCloud, hull: VisualHull, frames: GreyFrames) -> DenseC
     tree = cKDTree(cloud.points)
     distance, _ = tree.query(hull.points, workers=-1)
     points, normals = hull.resampled(distance > _NEAR * spacing - 0.5 * hull.spacing, _FINER * spacing)
-    distance, _ = tree.query(points, workers=-1)
-    points, normals = points[distance > _NEAR * spacing], normals[distance > _NEAR * spacing]
+    distance, nearest = tree.query(points, workers=-1)
+    height = ((points - cloud.points[nearest]) * cloud.normals_world[nearest]).sum(axis=1)
+    beside = (distance > _NEAR * spacing) & (np.abs(height) < _ABOVE * distance)
+    beside |= distance > _FAR * spacing
+    points, normals = points[beside], normals[beside]
     cameras = list(frames.cameras.values())
     directions = directions_from(np.asarray(hull.points.mean(axis=0), np.float64), cameras)
     before, facing = np.zeros(len(points), bool), np.zeros(len(points))

@@ -65,7 +65,11 @@ class VisualHull:
         dense, outwards = np.concatenate(copies).astype(np.float32), np.tile(normals, (count, 1))
         if not len(dense):
             return dense, outwards
-        _, kept = np.unique(np.floor(dense / spacing).astype(np.int64), axis=0, return_index=True)
+        lattice = np.floor((dense - dense.min(axis=0)) / spacing).astype(np.int64)
+        sides = lattice.max(axis=0) + 1
+        _, kept = np.unique(
+            (lattice[:, 0] * sides[1] + lattice[:, 1]) * sides[2] + lattice[:, 2], return_index=True
+        )
         return dense[kept], outwards[kept]
 
     def to_outline(self, points: NDArray[np.float32], normals: NDArray[np.float32]) -> NDArray[np.float32]:
