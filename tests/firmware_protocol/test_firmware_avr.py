@@ -208,3 +208,11 @@ def test_the_image_fits_with_room_for_the_stack(avr, avr_build):
     avr.run(0.2)
     assert avr.ask(Stop()).pulses == 5
     assert avr.stack - data_end > 200
+
+
+def test_the_image_has_no_heap_and_no_floating_point(avr_build):
+    listing = subprocess.run(["avr-nm", avr_build / "flash.elf"], capture_output=True, text=True, check=True)
+    names = {line.split()[-1] for line in listing.stdout.splitlines()}
+    assert "device_poll" in names
+    assert not names & {"malloc", "calloc", "realloc", "free"}
+    assert not [name for name in names if re.fullmatch(r"__\w*sf\w*\d?|__fp_\w+", name)]
