@@ -21,13 +21,16 @@ _FLAT = (int(_KINDS.PLANAR), int(_KINDS.PANORAMIC), int(_KINDS.PLANAR_OR_PANORAM
 _MARKERS = "put a few printed markers (ArUco or AprilTag) or posters into view"
 
 
-def explain(looks: Sequence[Look], outcomes: Sequence[Outcome], mapped: Sequence[Look]) -> str:
+def explain(
+    looks: Sequence[Look], outcomes: Sequence[Outcome], mapped: Sequence[Look], posed: int = 0
+) -> str:
     """What was seen and what to do, for a session whose poses could not be found.
 
     Args:
         looks: All frames that could be read.
         outcomes: What was tried on them, at least one.
         mapped: The keyframes of the last attempt.
+        posed: Frames that have a pose, too few of all.
     """
     last = outcomes[-1]
     best = max(outcomes, key=lambda outcome: outcome.registered)
@@ -45,8 +48,13 @@ def explain(looks: Sequence[Look], outcomes: Sequence[Outcome], mapped: Sequence
         advice = ["film in one slow sweep around the head", _MARKERS]
     if best.assessment is not None and not best.assessment.parallax:
         advice = ["walk around the head instead of turning the camera on the spot"]
+    found = (
+        f"Only {posed} of {len(looks)} frames could be posed"
+        if posed
+        else (f"No poses were found for {len(looks)} frames")
+    )
     return (
-        f"No poses were found for {len(looks)} frames: {'; '.join(seen) or 'they do not fit together'}. "
+        f"{found}: {'; '.join(seen) or 'they do not fit together'}. "
         f"To help, {', or '.join(dict.fromkeys(advice))}."
     )
 

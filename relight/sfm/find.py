@@ -104,10 +104,7 @@ def find_poses(
     )
     share = len(result.cameras) / len(records)
     if share < config.min_registered:
-        raise GeometryError(
-            f"Only {len(result.cameras)} of {len(records)} frames could be posed (needed: "
-            f"{100 * config.min_registered:.0f} %). {explain(search.looks, [best[1]], search.mapped)}"
-        )
+        raise GeometryError(explain(search.looks, [best[1]], search.mapped, len(result.cameras)))
     missing = _missing(search, result)
     report = {
         "frames": len(records),

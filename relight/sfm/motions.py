@@ -15,7 +15,7 @@ from relight.sfm.survey import Look
 _FAR = 5  # frames apart in the order of capture
 _STILL = 0.002  # motion, share of the longer side: a pixel of 512
 _MOVING = 0.008
-_LEAST_STILL, _LEAST_MOVING = 0.15, 0.05  # of a pair's matches
+_LEAST_STILL = 0.15  # of a pair's matches; the head may be a few among a wall's thousand
 _LEAST_MATCHES = 10
 _LEAST_PAIRS = 0.5  # share of the far pairs
 _ASKED = 60  # far pairs of which each side's motion is found
@@ -44,7 +44,7 @@ def still_features(looks: Sequence[Look], pairs: Sequence[Pair]) -> list[NDArray
         still, moving = motion < _STILL, motion > _MOVING
         far += 1
         enough_still = still.sum() >= max(_LEAST_MATCHES, _LEAST_STILL * len(motion))
-        both += int(enough_still and moving.sum() >= max(_LEAST_MATCHES, _LEAST_MOVING * len(motion)))
+        both += int(enough_still and moving.sum() >= _LEAST_MATCHES)
         flags[pair.first][pair.matches[still, 0]] = True
         flags[pair.second][pair.matches[still, 1]] = True
     if not far or both < _LEAST_PAIRS * far:

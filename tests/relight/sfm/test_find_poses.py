@@ -1,12 +1,14 @@
 """Poses from features whose truth is known, with noise of a sixth of a pixel."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from relight.alignment import align_cameras, pose_errors
 from relight.errors import GeometryError
+from relight.sfm.features import Features
 
 
 def errors(result, cameras):
@@ -108,6 +110,44 @@ def test_two_rooms_are_refused_as_pieces(scene, make_arc, found_from):
     looks = scene().looks(cameras)[:8] + scene(seed=5).looks(cameras)[8:]
     with pytest.raises(GeometryError, match=r"8 of 16|pieces"):
         found_from(looks)
+
+
+def test_printed_markers_of_known_size_give_the_metre(scene, make_arc, found_from):
+    cameras = make_arc(10)
+    corners = [[*np.array([[x, y - 0.14, 0.05] for x, y in MARKER]), 0.06 * k, 0, 0] for k in range(-1, 2)]
+    looks = [
+        with_corners(look, cameras[k], np.concatenate(corners))
+        for k, look in enumerate(scene().looks(cameras))
+    ]
+    result = found_from(looks, marker_side_m=0.03)
+    centres = np.array([camera.centre_world for camera in result.cameras.values()])
+    truth = np.array([camera.centre_world for camera in cameras])
+    assert result.metric
+    assert "30 mm" in result.scale_source
+    # Corners of 0.1 px on sides of 22 px, twelve sides, each corner in ten frames.
+    found, true = (
+        np.linalg.norm(np.diff(centres, axis=0), axis=1),
+        np.linalg.norm(np.diff(truth, axis=0), axis=1),
+    )
+    assert np.median(found / true) == pytest.approx(1.0, abs=0.005)
+
+
+MARKER = 0.03 * np.array([[0, 1], [1, 1], [1, 0], [0, 0]])
+
+
+def with_corners(look, camera, corners):
+    """The look with the corners of printed markers [4 M, 3] that the camera sees."""
+    cam = corners @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
+    places = cam[:, :2] / cam[:, 2:] * camera.K[0, 0] + camera.K[:2, 2]
+    places += 0.1 * np.random.default_rng(look.index).normal(size=places.shape)
+    features = look.features
+    more = Features(
+        np.concatenate([features.places_px, places]),
+        features.descriptors,
+        np.concatenate([features.labels, np.arange(len(corners))]),
+        np.concatenate([features.colors, np.zeros((len(corners), 3), np.float32)]),
+    )
+    return replace(look, features=more)
 
 
 def turned(angle_deg):
