@@ -114,7 +114,8 @@ def test_two_rooms_are_refused_as_pieces(scene, make_arc, found_from):
 
 def test_printed_markers_of_known_size_give_the_metre(scene, make_arc, found_from):
     cameras = make_arc(10)
-    corners = [[*np.array([[x, y - 0.14, 0.05] for x, y in MARKER]), 0.06 * k, 0, 0] for k in range(-1, 2)]
+    one = np.array([[x, y - 0.14, 0.05] for x, y in MARKER])
+    corners = [one + np.array([0.06 * k, 0.0, 0.0]) for k in range(-1, 2)]
     looks = [
         with_corners(look, cameras[k], np.concatenate(corners))
         for k, look in enumerate(scene().looks(cameras))
