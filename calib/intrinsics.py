@@ -64,7 +64,7 @@ class IntrinsicsResult:
         size: (width, height) of the pictures.
         model: a name of `LENS_MODELS`.
         lens: [9] fx, fy, cx, cy, k1, k2, p1, p2, k3; pixel centres at 0.5.
-        covariance: [9, 9] of it; zero rows for terms that the model does not have.
+        covariance: [9, 9] of it; zero for terms that the model does not have, unless they are in doubt.
         bend_m: [2] bend of the board along its width and height; None = taken as flat.
         views: names of the pictures used, in the order in which they came.
         observations: their corners; outliers have no weight.
@@ -167,6 +167,8 @@ def calibrate_intrinsics(
         free = free_of(model, bent)
         observations, solution = _weighted_fit(observations, with_only(solution, free), free)
         uncertainty = uncertainty_of(observations, solution, free)
+        if trials and uncertainty.correlation_factor > 1.0:
+            uncertainty = _with_doubt_of_model(observations, solution, uncertainty, bent)
         check_determined(observations, solution, uncertainty)
         grid, _ = pixel_grid(observations.size)
         halves = compare_halves(observations, solution, free, grid)
@@ -271,3 +273,22 @@ def _weighted_fit(
         observations = replace(observations, weights=weights)
         solution = minimise(observations, solution, free)
     return observations, solution
+
+
+def _with_doubt_of_model(
+    observations: Observations, solution: Solution, uncertainty: Uncertainty, bent: bool
+) -> Uncertainty:
+    """The uncertainty with the difference to the richest lens in it.
+
+    Where the errors of a picture hang together they hide small terms from the held-out error: the centre of
+    the picture and the tangential terms can then be off together by much more than a model without the
+    latter admits.
+    """
+    free = free_of(RICHEST, bent)
+    richest = minimise(observations, solution, free)
+    difference = richest.shared - solution.shared
+    return replace(
+        uncertainty,
+        covariance=uncertainty.covariance + np.outer(difference, difference),
+        mean_motion=uncertainty_of(observations, richest, free).mean_motion,
+    )

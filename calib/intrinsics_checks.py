@@ -165,9 +165,9 @@ def warnings_of(
     if uncertainty.correlation_factor > _CLEAR_CORRELATION:
         sentences.append(
             "The errors of a picture hang together (a board that is not flat or that moves, or a "
-            "stabiliser); "
-            f"the uncertainties were made {np.sqrt(uncertainty.correlation_factor):.1f} times as large for "
-            "it."
+            "stabiliser); the uncertainties were made "
+            f"{np.sqrt(uncertainty.correlation_factor):.1f} times as large for it. Stills of a board at "
+            "rest, on a plate, do better."
         )
     for check in halves:
         if not check.agrees:

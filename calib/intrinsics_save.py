@@ -26,7 +26,7 @@ _SCHEMA, _SCHEMA_VERSION = "relight-intrinsics-evidence", 1
 def intrinsics_of(result: IntrinsicsResult, source: str) -> Intrinsics:
     """The entry of calibration.json.
 
-    Terms that the model does not have are zero with a standard deviation of zero.
+    Terms that the model does not have are zero; so is their standard deviation, unless they are in doubt.
 
     Args:
         result: the calibration.

@@ -128,7 +128,7 @@ def arrows(points: Floats, vectors: Floats, size: tuple[int, int], label: str) -
 def bars(values: Sequence[float], names: Sequence[str], label: str) -> str:
     """One bar a value; the name shows when it is pointed at."""
     width, height = 640.0, 150.0
-    top = max([*values, 1e-12])
+    top = 1.15 * max([*values, 1e-12])  # room for the note
     step = width / max(len(values), 1)
     marks = (
         f'<rect x="{(i + 0.1) * step:.1f}" y="{height * (1 - value / top):.1f}" '
@@ -137,7 +137,7 @@ def bars(values: Sequence[float], names: Sequence[str], label: str) -> str:
         for i, (value, name) in enumerate(zip(values, names, strict=True))
     )
     axis = f'<path d="M0 {height}H{width}" stroke="var(--line)"/>'
-    note = f'<text x="4" y="14" font-size="13" fill="var(--quiet)">highest {top:.3g}</text>'
+    note = f'<text x="4" y="14" font-size="13" fill="var(--quiet)">highest {top / 1.15:.3g}</text>'
     return svg(width, height + 2, [*marks, axis, note], label)
 
 

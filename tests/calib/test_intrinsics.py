@@ -79,6 +79,31 @@ def test_a_noisy_picture_counts_less(make_views, board):
     assert result.sigma[0] < 1.3 * clean.sigma[0]
 
 
+def test_small_terms_that_the_errors_hide_are_in_the_uncertainty(make_views, board, lens):
+    """Pictures that are each sheared a little, as by a rolling shutter, of a lens that is a little askew."""
+    off = []
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        views, _ = make_views(rng, 16, noise_px=0.05)
+        sheared = [
+            BoardView(
+                view.name,
+                view.size,
+                view.ids,
+                view.corners_px + (view.corners_px - view.corners_px.mean(0)) @ rng.normal(0, 2e-3, (2, 2)),
+                2.0,
+                "both",
+            )
+            for view in views
+        ]
+        result = calibrate_intrinsics(sheared, board)
+        assert any("hang together" in sentence for sentence in result.warnings)
+        off.append(((result.lens - lens) / np.maximum(result.sigma, 1e-9))[:4])
+    # Twenty-four numbers, of which four belong together each: the root mean square is near one.
+    assert np.sqrt(np.mean(np.square(off))) < 1.6
+    assert np.abs(off).max() < 4.0
+
+
 def test_the_layout_of_most_views_is_the_boards(make_views):
     board = Board((5, 6), 0.03, 0.022)
     views, _ = make_views(np.random.default_rng(4), 12, board=board)
