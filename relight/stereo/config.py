@@ -26,7 +26,7 @@ class StereoConfig:
         cell_px: Side of the cube that one point stands for, in pixels of the nearer views.
     """
 
-    references: int = 40
+    references: int = 36
     angles_deg: tuple[tuple[float, ...], ...] = (
         (4.0, 7.0, 10.0),
         (4.0, 8.0, 12.0),
