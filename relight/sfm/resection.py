@@ -17,7 +17,7 @@ from relight.sfm.survey import Look
 LEAST_INLIERS = 20
 """Points that must agree on a pose."""
 
-_LEAST_SHARE = 0.25  # of the matches that agree
+_LEAST_SHARE = 0.35  # of the matches that agree
 _NEIGHBOURS = 6  # posed frames, nearest in the order of capture, that a frame is compared with
 _MAX_ERROR_PX = 3.0
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from relight.sfm.attempts import Outcome
+from relight.sfm.checks import path_jumps
 from relight.sfm.config import PoseResult, SfmConfig
 from relight.sfm.lenses import Lens
 from relight.sfm.markers import Board, metres_per_unit
@@ -17,6 +19,7 @@ from relight.sfm.sparse import Sparse
 from relight.sfm.survey import Look
 from relight.sfm.world import TYPICAL_DISTANCE, canonical_world
 
+_ROUNDS = 3
 _ENOUGH_FAN_DEG = 30.0  # an arc of 12 degrees left an unknown focal length 2 % wrong
 
 
@@ -43,7 +46,12 @@ def make_result(
     sparse = outcome.sparse
     assert sparse is not None
     resected, failed = resect_all(looks, kept, sparse, outcome.cameras, config.seed)
-    by_position = {kept[position]: camera for position, camera in sparse.cameras.items()} | resected
+    mapped_cameras = {kept[position]: camera for position, camera in sparse.cameras.items()}
+    for _ in range(_ROUNDS):  # one that is astray bends the path that its neighbours are judged by
+        for astray in path_jumps(replace(sparse, cameras=mapped_cameras | resected)):
+            if resected.pop(astray, None) is not None:
+                failed[astray] = "the pose that its points agree on lies off the camera's path"
+    by_position = mapped_cameras | resected
     mapped = [looks[i] for i in kept]
     unit = metres_per_unit(_corners(sparse, mapped), board, config.marker_side_m)
     cameras = [sparse.cameras[position] for position in sorted(sparse.cameras)]
