@@ -18,6 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import t as student_t
 
 from calib.bundle import SHARED_SIZE, Normals, Observations, Solution, normals_at
 from calib.errors import IntrinsicsError
@@ -177,9 +178,13 @@ def _clustered(
     ratio = float(np.trace(spread)) / (len(information) * variance)
     if ratio <= 1.0 + 2.0 * np.sqrt(scatter) / len(information):
         return 1.0, None
+    # The spread is known from few views only: Student's 95 % interval, drawn as that of a wider normal. Its
+    # freedom is between that of one direction (scatter) and that of the ratio, which all directions share.
+    freedom = max(4.0 * len(information) / scatter - 1.0, 2.0)
+    student = float((student_t.ppf(0.975, freedom) / 1.95996) ** 2)
     sizes, directions = np.linalg.eigh(spread)
-    root = white @ directions * np.sqrt(np.maximum(sizes, ratio * variance))
-    return ratio, root @ root.T
+    root = white @ directions * np.sqrt(student * np.maximum(sizes, ratio * variance))
+    return student * ratio, root @ root.T
 
 
 def _about_camera(solution: Solution) -> Floats:
