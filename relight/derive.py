@@ -37,7 +37,8 @@ from relight.scene import load_scene
 from relight.sfm import find_poses
 from relight.stage_cache import StageCache
 from relight.stages import Progress, Stages, no_progress
-from relight.stereo import dense_cloud
+from relight.stereo import DenseCloud, dense_cloud
+from relight.stereo.completion import complete_with_masks
 
 
 def derive_scene(
@@ -130,11 +131,31 @@ class _Finder:
         self._cache.begin("masks", *(() if given else ("cloud",)))
         shutil.rmtree(session.masks_dir, ignore_errors=True)
         folder.rename(session.masks_dir)
+        report = dict(result.report)
         if not given:
-            write_ply(session.points_path, _subset(cloud, result.keep))
+            report |= self._clean(cameras, cloud, result.keep)
             self._cache.moved("cloud")
-        report = {**result.report, "points_left": int(result.keep.sum())}
         self._store("masks", frames, report, result.warnings)
+
+    def _clean(
+        self, cameras: Mapping[int, Camera], cloud: PointCloud, keep: NDArray[np.bool_]
+    ) -> dict[str, int]:
+        """Leaves the subject in points.ply, with what its outlines tell of where stereo saw too little."""
+        if not keep.any():
+            raise GeometryError(
+                "No point of the cloud lies on the subject in enough frames; check that the head keeps still "
+                "and fills a good part of the picture."
+            )
+        assert cloud.normals is not None  # of a cloud that was found
+        points = cloud.points[keep].astype(np.float32)
+        kept = DenseCloud(points, cloud.normals[keep], np.ones(len(points), np.float32))
+        with self._stages.stage("masks"):
+            whole = complete_with_masks(self._session, cameras, kept)
+        write_ply(
+            self._session.points_path,
+            PointCloud(whole.points.astype(np.float64), normals=whole.normals_world),
+        )
+        return {"points_left": len(points), "points_from_outlines": len(whole.points) - len(points)}
 
     def scale(self, frames: Sequence[FrameRecord]) -> None:
         """Metres, for a world that has none yet."""
@@ -198,17 +219,4 @@ def _scale_of(session: Session, cameras: Mapping[int, Camera], progress: Progres
         flash=flash,
         flash_offset_cam_m=None if offset is None else np.asarray(offset.value),
         rotation_deg=session.info["image"]["rotation_deg"],
-    )
-
-
-def _subset(cloud: PointCloud, keep: NDArray[np.bool_]) -> PointCloud:
-    if not keep.any():
-        raise GeometryError(
-            "No point of the cloud lies on the subject in enough frames; check that the head keeps still and "
-            "fills a good part of the picture."
-        )
-    return PointCloud(
-        cloud.points[keep],
-        normals=None if cloud.normals is None else cloud.normals[keep],
-        colors=None if cloud.colors is None else cloud.colors[keep],
     )

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from collections.abc import Mapping
 from dataclasses import asdict
 from datetime import UTC, datetime
@@ -26,9 +27,10 @@ from capture.session import Session
 from relight.derive import derive_scene
 from relight.devices import choose_device, describe_device
 from relight.errors import PlanError
-from relight.geometry_plan import GEOMETRY_STAGES, GeometryConfig
+from relight.face import find_face, save_face
+from relight.geometry_plan import GEOMETRY_STAGES, GeometryConfig, candidates
 from relight.photometric import SolveConfig, solve
-from relight.plan import Action, Plan
+from relight.plan import Action, Decision, Plan
 from relight.planning import make_plan
 from relight.portrait import Portrait
 from relight.previews import write_previews
@@ -94,7 +96,7 @@ def fit(
         with stages.stage("plan"):
             plan = make_plan(opened, forced, max_seconds, geometry).after(plan)
         plan.check()
-    config = SolveConfig()
+    config = SolveConfig(mirror=plan.runs("face_prior"))
     folder = opened.portraits_dir / name
     cache = StageCache(opened)
     key = _solve_key(opened, cache, plan, config, torch_device)
@@ -109,6 +111,10 @@ def fit(
             progress=told,
         )
         portrait = solve(scene, config, told)
+
+    if plan.runs("face_prior"):
+        with stages.stage("face"):
+            plan = plan.with_decision(_find_face(opened, portrait, progress))
 
     folder.mkdir(parents=True, exist_ok=True)
     for outdated in ("evaluation.json", "config.json"):  # they belong to the portrait that is replaced now
@@ -127,6 +133,31 @@ def fit(
     _write_json(folder / "config.json", resolved)
     write_report(session, name)
     return folder
+
+
+def _find_face(session: Session, portrait: Portrait, progress: Progress) -> Decision:
+    """Finds the face of a solved portrait and keeps it in the session's scene folder."""
+    progress("face", 0.0)
+    cameras = session.load_scene_cameras()
+    result = find_face(
+        portrait.points.cpu().double().numpy(),
+        portrait.normals_world.cpu().double().numpy(),
+        portrait.albedo.cpu().double().numpy(),
+        {
+            record.index: cameras[record.index]
+            for record in candidates(session.frames)
+            if record.index in cameras
+        },
+        confidence=portrait.confidence.cpu().double().numpy(),
+        rotation_deg=session.info["image"]["rotation_deg"],
+        progress=progress,
+    )
+    folder = session.scene_dir / "face"
+    if result.prior is None:
+        shutil.rmtree(folder, ignore_errors=True)
+        return Decision("face_prior", Action.SKIP, result.decision.reason)
+    save_face(result.prior, folder)
+    return Decision("face_prior", Action.RUN, result.decision.reason)
 
 
 def _solve_key(

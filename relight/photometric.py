@@ -15,7 +15,8 @@ no-flash frame a point shows its room radiance; a flash frame adds
    the geometric normal as a prior in the directions that the lights do not span. The prior's weight is the
    ratio of the two variances, the photometric one measured from the residual;
 4. albedo: robust least squares per channel;
-5. points that the flash did not reach are filled from their neighbours (`relight.infill`).
+5. points that the flash did not reach are filled, on a face from its other side (`relight.mirror_infill`),
+   else from their neighbours (`relight.infill`).
 
 Robust: frames in which gloss, a shadow, a wrong visibility or a moved pose spoils a point lose weight by a
 Cauchy function of their residual. Clipped pixels never had any.
@@ -37,6 +38,7 @@ from scipy.spatial import cKDTree
 from relight.cloud import CloudConfig, prepare_cloud
 from relight.errors import PlanError
 from relight.infill import infill
+from relight.mirror_infill import mirror_infill
 from relight.observations import Observations, observe_points
 from relight.portrait import Portrait
 from relight.reflectance import GRAZING, Reflectance, fit_local_gloss, fit_reflectance
@@ -58,6 +60,7 @@ _GLOSS_CUBE = 8.0  # spacings: gloss changes with the material, over centimetres
 _GLOSS_STEP = 4  # every so many points are enough for what is pooled
 _GLOSS_PRIOR = 8.0  # points whose word the subject's mean gloss counts for
 _GLOSS_LIMIT = 4.0
+_MIRROR_WORTH = 0.03  # of the points that no flash reached, from which on a face is looked for
 _OUTSIDE_LIMIT = (
     0.05  # share of the frames that may show a point off the subject: masks and poses err by a pixel
 )
@@ -75,6 +78,7 @@ class SolveConfig:
         fit_gloss: Whether the subject's gloss and retro-reflection are fitted; otherwise it is taken as
             Lambertian.
         fit_gains: Whether the flash frames' gains are fitted; otherwise all flashes are taken as equal.
+        mirror: Whether what no flash reached of a face is taken from its other side, before its neighbours.
         known: Information (sum of weighted squared cosines over the flash frames) that makes an albedo
             known: 0.25 is one flash frame at 60 degrees.
     """
@@ -83,6 +87,7 @@ class SolveConfig:
     normal_sigma_rad: float = 0.06
     fit_gloss: bool = True
     fit_gains: bool = True
+    mirror: bool = True
     known: float = 0.25
 
 
@@ -175,7 +180,12 @@ def solve(scene: Scene, config: SolveConfig = SolveConfig(), progress: Progress 
             "The flash frames do not light any point enough to solve for it; is the flash flag of the frames "
             "right, and is the subject what the flash lights?"
         )
-    albedo = infill(points, albedo, information, known=config.known, nearest=surface.spacing)
+    filled, worth, from_mirror = albedo, information, 0.0
+    if config.mirror and float(known.float().mean()) < 1.0 - _MIRROR_WORTH:
+        mirrored = mirror_infill(scene, points, normals, albedo, information, config.known)
+        filled, worth = mirrored.values, mirrored.information
+        from_mirror = float(mirrored.filled.float().mean())
+    albedo = infill(points, filled, worth, known=config.known, nearest=surface.spacing)
     room = infill(points, room, room_information, known=0.3, nearest=surface.spacing)
     gauge = ALBEDO_95 / float(torch.quantile(_sampled(albedo[known].mean(dim=1)), 0.95).clamp(min=1e-6))
     albedo = (albedo * gauge).clamp(min=0.0)
@@ -209,6 +219,7 @@ def solve(scene: Scene, config: SolveConfig = SolveConfig(), progress: Progress 
             "relative_noise": round(relative, 4),
             "cloud_noise": surface.noise,
             "known_share": round(float(known.float().mean()), 4),
+            "mirrored_share": round(from_mirror, 4),
         },
     )
     return portrait if bool(on_subject.all()) else portrait.subset(on_subject)

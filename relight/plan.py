@@ -21,7 +21,7 @@ from typing import Any
 
 from relight.errors import PlanError
 
-FORCEABLE = ("undistortion", "redundant_views", "room_shading", "masks")
+FORCEABLE = ("undistortion", "redundant_views", "room_shading", "masks", "face_prior")
 """Decisions that `--force NAME=run|skip` may turn round."""
 
 
@@ -86,6 +86,11 @@ class Plan:
             for decision in self.decisions
         )
         return replace(self, decisions=tuple(decisions), estimated_s=earlier.estimated_s)
+
+    def with_decision(self, decision: Decision) -> Plan:
+        """The plan with a decision in the place of the one of its name."""
+        decisions = tuple(decision if each.name == decision.name else each for each in self.decisions)
+        return replace(self, decisions=decisions)
 
     def check(self) -> None:
         """Does nothing for a session that can be fitted.

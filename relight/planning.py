@@ -97,6 +97,7 @@ def make_plan(
             _undistortion(poses, forced),
             _normals(cloud),
             room,
+            _face_prior(forced),
             time,
         ),
         frames=tuple(record.index for record in fitted),
@@ -210,6 +211,14 @@ def _room_shading(fitted: list[FrameRecord], session: Session, forced: Mapping[s
     left_out = _all_but(unlit, max(FEWEST_UNLIT, len(lit)), "dark")
     saving = f"{len(left_out)} unlit frames that show the dark again" if left_out else ""
     return Decision(name, action, seen, saving, forced=action is not found), left_out
+
+
+def _face_prior(forced: Mapping[str, Action]) -> Decision:
+    """Whether a face is looked for; whether there is one is known when the surface is solved."""
+    name = "face_prior"
+    if forced.get(name) is Action.SKIP:
+        return Decision(name, Action.SKIP, "not wanted", forced=True)
+    return Decision(name, Action.RUN, "looked for on the solved surface; dropped where there is no face")
 
 
 def _time(fitted: list[FrameRecord], cloud: PointCloud | None, max_seconds: float | None) -> Narrowing:

@@ -91,6 +91,11 @@ class Scene:
         self._records = records
         self._distorted = distorted
 
+    @property
+    def rotation_deg(self) -> int:
+        """Clockwise turn that shows the frames upright."""
+        return int(self._session.info["image"]["rotation_deg"])
+
     def observe(self, view: View) -> Observation:
         """Reads, linearises and undistorts a frame and its mask."""
         record = self._records[view.index]

@@ -37,7 +37,8 @@ def add_forced(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="NAME=run|skip",
-        help="turn a decision of the plan round: undistortion, redundant_views, room_shading or masks",
+        help="turn a decision of the plan round: undistortion, redundant_views, room_shading, masks or "
+        "face_prior",
     )
 
 

@@ -265,6 +265,7 @@ class MemoryScene:
     flash_offset_cam_m: np.ndarray = field(default_factory=lambda: FLASH_OFFSET_CAM_M.copy())
     device: torch.device = field(default_factory=lambda: torch.device("cpu"))
     clip: float = 0.95
+    rotation_deg: int = 0
 
     @property
     def views(self):

@@ -12,7 +12,8 @@ from capture.session import Session
 from relight.cli import _COMMANDS, main
 
 SENTENCES = {
-    "no session": (["fit", "nowhere"], "nowhere is no session"),
+    "no session": (["plan", "nowhere"], "nowhere is no session"),
+    "nothing to import": (["fit", "nowhere"], "nowhere does not exist"),
     "no such preset": (["fit", "S", "--preset", "magic"], "known are solve, fast, balanced, paper"),
     "a preset to come": (["fit", "S", "--preset", "paper"], "still to come"),
     "no name for a folder": (["fit", "S", "--name", "../x"], "cannot be called"),

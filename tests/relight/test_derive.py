@@ -91,6 +91,7 @@ def finders(monkeypatch):
     monkeypatch.setattr(derive, "find_poses", stand_ins.poses)
     monkeypatch.setattr(derive, "dense_cloud", stand_ins.cloud)
     monkeypatch.setattr(derive, "find_masks", stand_ins.masks)
+    monkeypatch.setattr(derive, "complete_with_masks", lambda session, cameras, cloud: cloud)
     monkeypatch.setattr(derive, "_scale_of", stand_ins.scale)
     return stand_ins
 

@@ -99,6 +99,7 @@ def test_a_session_with_poses_and_a_cloud_can_be_fitted(tmp_path):
         "normals": Action.RUN,
         "masks": Action.SKIP,
         "scale": Action.GIVEN,
+        "face_prior": Action.RUN,
         "room_shading": Action.RUN,
         "time": Action.RUN,
     }
@@ -114,15 +115,6 @@ def test_what_the_scene_brings_is_taken(tmp_path):
     assert "16 of 16" in plan.decision("masks").reason
 
 
-@pytest.mark.parametrize(
-    ("options", "name", "word"),
-    [
-        ({"poses": False}, "cloud", "without the poses"),
-        ({"poses": False, "cloud": False, "flags": (1, 0, 0)}, "poses", "3 usable frames are too few"),
-        ({"flags": (0,) * 8}, "flash", "no frame is fully lit"),
-        ({"flags": (1,) * 8}, "flash", "all 8 frames are lit"),
-    ],
-)
 def test_what_is_not_given_is_found(tmp_path):
     plan = make_plan(make_session(tmp_path / "s", poses=False, cloud=False))
     plan.check()
@@ -134,6 +126,15 @@ def test_what_is_not_given_is_found(tmp_path):
     assert actions(with_poses)["cloud"] is Action.RUN
 
 
+@pytest.mark.parametrize(
+    ("options", "name", "word"),
+    [
+        ({"poses": False}, "cloud", "without the poses"),
+        ({"poses": False, "cloud": False, "flags": (1, 0, 0)}, "poses", "3 usable frames are too few"),
+        ({"flags": (0,) * 8}, "flash", "no frame is fully lit"),
+        ({"flags": (1,) * 8}, "flash", "all 8 frames are lit"),
+    ],
+)
 def test_a_session_that_cannot_be_fitted_is_refused_with_what_to_add(tmp_path, options, name, word):
     plan = make_plan(make_session(tmp_path / "s", **options))
     assert plan.decision(name).action is Action.REFUSE
