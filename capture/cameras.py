@@ -71,6 +71,13 @@ class Camera:
         centre: NDArray[np.float64] = -rotation.T @ translation
         return centre
 
+    @property
+    def opencv_distortion(self) -> NDArray[np.float64]:
+        """`distortion` in a length that OpenCV takes: it refuses one or two coefficients."""
+        padded = np.zeros(max(4, len(self.distortion)))
+        padded[: len(self.distortion)] = self.distortion
+        return padded
+
     def scaled(self, factor: float) -> Camera:
         """The camera of the picture resized by a factor, its sides rounded to whole pixels.
 

@@ -24,5 +24,5 @@ def distortion_px(camera: Camera) -> float:
     )
     rays = (pixels - camera.K[:2, 2]) / camera.K.diagonal()[:2]
     straight = np.concatenate([rays, np.ones((len(rays), 1))], 1)
-    bent, _ = cv2.projectPoints(straight, np.zeros(3), np.zeros(3), camera.K, camera.distortion)
+    bent, _ = cv2.projectPoints(straight, np.zeros(3), np.zeros(3), camera.K, camera.opencv_distortion)
     return float(np.linalg.norm(bent.reshape(-1, 2) - pixels, axis=1).max())

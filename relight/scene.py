@@ -181,7 +181,7 @@ def _undistortion_grid(
     to_integer_centres = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1]])
     x, y = cv2.initUndistortRectifyMap(
         to_integer_centres @ distorted.K,
-        distorted.distortion,
+        distorted.opencv_distortion,
         np.eye(3),
         to_integer_centres @ straight.K,
         (straight.width, straight.height),

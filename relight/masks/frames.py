@@ -127,7 +127,7 @@ class FrameSource:
         distorted = self._distorted[frame.index]
         grid = cv2.initUndistortRectifyMap(
             _CENTRES @ distorted.K,
-            distorted.distortion,
+            distorted.opencv_distortion,
             np.eye(3),
             _CENTRES @ frame.camera.K,
             (frame.camera.width, frame.camera.height),
@@ -165,7 +165,7 @@ def _straight_px(
 ) -> NDArray[np.float64]:
     """Where pixels [N, 2] of a lens's picture are in that of a pinhole K; centres at 0.5 in both."""
     straight = cv2.undistortPoints(
-        np.ascontiguousarray(pixels).reshape(-1, 1, 2), distorted.K, distorted.distortion, P=K
+        np.ascontiguousarray(pixels).reshape(-1, 1, 2), distorted.K, distorted.opencv_distortion, P=K
     )
     return np.nan_to_num(np.asarray(straight, np.float64).reshape(-1, 2), posinf=0.0, neginf=0.0)
 

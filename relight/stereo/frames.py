@@ -97,11 +97,9 @@ class GreyFrames:
         if not given.distortion.any():
             return np.ascontiguousarray(image, np.float32)
         integer_centres = given.K - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
-        coefficients = np.zeros(max(4, len(given.distortion)))  # OpenCV takes no fewer than four
-        coefficients[: len(given.distortion)] = given.distortion
         grid = cv2.initUndistortRectifyMap(
             integer_centres,
-            coefficients,
+            given.opencv_distortion,
             np.eye(3),
             integer_centres,
             (given.width, given.height),
