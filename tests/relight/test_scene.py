@@ -141,6 +141,17 @@ def test_frames_are_undistorted_to_the_pinhole(tmp_path, k1):
     np.testing.assert_allclose(observation.radiance.numpy()[valid], expected[valid], atol=0.001)
 
 
+def test_a_single_coefficient_is_a_lens_too(tmp_path):
+    picture = np.full((30, 40, 3), 0.4)
+    short, long = ([-0.15], [-0.15, 0.0, 0.0, 0.0])
+    valid = []
+    for name, distortion in (("short", short), ("long", long)):
+        session = one_frame_session(tmp_path / name, straight_camera(distortion=distortion), picture)
+        scene = load_scene(session, frames=[0])
+        valid.append(scene.observe(scene.views[0]).radiance.numpy())
+    np.testing.assert_array_equal(valid[0], valid[1])
+
+
 def test_distortion_can_be_taken_for_none(tmp_path):
     picture = np.random.default_rng(0).uniform(0, 0.9, (30, 40, 3)).astype(np.float32)
     session = one_frame_session(tmp_path / "s", straight_camera(distortion=[1e-5]), picture)
