@@ -155,6 +155,8 @@ def _pixels(
         u, v, width, height = v, width - u, height, width
     pixels = np.stack([u, v], axis=1)
     if camera.distortion.any():
-        straight = cv2.undistortPoints(pixels.reshape(-1, 1, 2), camera.K, camera.opencv_distortion, P=camera.K)
+        straight = cv2.undistortPoints(
+            pixels.reshape(-1, 1, 2), camera.K, camera.opencv_distortion, P=camera.K
+        )
         pixels = straight.reshape(-1, 2)
     return pixels

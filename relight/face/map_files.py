@@ -120,7 +120,9 @@ def _read(path: Path, camera: Camera) -> NDArray[np.float32]:
             f"The position map {path} spans {np.ptp(uv_px):.1f} px; it must be in pixels, not 0..1."
         )
     if camera.distortion.any():
-        straight = cv2.undistortPoints(uv_px.reshape(-1, 1, 2), camera.K, camera.opencv_distortion, P=camera.K)
+        straight = cv2.undistortPoints(
+            uv_px.reshape(-1, 1, 2), camera.K, camera.opencv_distortion, P=camera.K
+        )
         uv_px = straight.reshape(uv_px.shape)
     return uv_px.astype(np.float32)
 
