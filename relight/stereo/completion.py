@@ -6,7 +6,7 @@ or before what the cloud shows (the hull bridges hollows), and where cameras loo
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import torch
@@ -56,24 +56,22 @@ def complete_with_masks(
 def completed(cloud: DenseCloud, hull: VisualHull, frames: GreyFrames) -> DenseCloud:
     """The cloud with the points of a hull that it lacks."""
     spacing = _spacing(cloud.points)
-    tree = cKDTree(cloud.points)
-    distance, _ = tree.query(hull.points, workers=-1)
-    points, normals = hull.resampled(distance > _NEAR * spacing - 0.5 * hull.spacing, _FINER * spacing)
-    distance, nearest = tree.query(points, workers=-1)
-    height = ((points - cloud.points[nearest]) * cloud.normals_world[nearest]).sum(axis=1)
-    beside = (distance > _NEAR * spacing) & (np.abs(height) < _ABOVE * distance)
-    beside |= distance > _FAR * spacing
-    points, normals = points[beside], normals[beside]
     cameras = list(frames.cameras.values())
     directions = directions_from(np.asarray(hull.points.mean(axis=0), np.float64), cameras)
-    before, facing = np.zeros(len(points), bool), np.zeros(len(points))
-    for place in spread_out(directions, _MOST_VIEWS):
-        camera = cameras[place]
-        hides, hidden = _against_cloud(points, cloud, camera, spacing)
-        before |= hides
-        towards = camera.centre_world - points
-        cosine = (towards * normals).sum(axis=1) / np.linalg.norm(towards, axis=1).clip(1e-12)
-        facing += (cosine > _FACING) & ~hidden
+    views = [cameras[place] for place in spread_out(directions, _MOST_VIEWS)]
+    tree, reach = cKDTree(cloud.points), _FAR * spacing
+    # Most of the hull is where no camera looked: its coarse points tell, which spares most of the fine ones.
+    distance, _ = tree.query(hull.points, distance_upper_bound=reach, workers=-1)
+    _, facing = _seen(hull.points, hull.normals_world, cloud, views, spacing)
+    chosen = (distance > _NEAR * spacing - 0.5 * hull.spacing) & (facing > 0)
+    points, normals = hull.resampled(chosen, _FINER * spacing)
+    distance, nearest = tree.query(points, distance_upper_bound=reach, workers=-1)
+    far = ~np.isfinite(distance)
+    nearest = np.where(far, 0, nearest)
+    height = ((points - cloud.points[nearest]) * cloud.normals_world[nearest]).sum(axis=1)
+    beside = far | ((distance > _NEAR * spacing) & (np.abs(height) < _ABOVE * distance))
+    points, normals = points[beside], normals[beside]
+    before, facing = _seen(points, normals, cloud, views, spacing)
     taken = ~before & (facing >= _FEWEST_FACING)
     points, normals = hull.to_outline(points[taken], normals[taken]), normals[taken]
     return DenseCloud(
@@ -83,6 +81,24 @@ def completed(cloud: DenseCloud, hull: VisualHull, frames: GreyFrames) -> DenseC
         {**cloud.report, "from_masks": len(points), "points": len(cloud.points) + len(points)},
         cloud.warnings,
     )
+
+
+def _seen(
+    points: NDArray[np.float32],
+    normals: NDArray[np.float32],
+    cloud: DenseCloud,
+    views: Sequence[Camera],
+    spacing: float,
+) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
+    """[P] whether points hide what the cloud shows to some camera, and how many look at each."""
+    before, facing = np.zeros(len(points), bool), np.zeros(len(points), np.int64)
+    for camera in views if len(points) else ():
+        hides, hidden = _against_cloud(points, cloud, camera, spacing)
+        before |= hides
+        towards = camera.centre_world - points
+        cosine = (towards * normals).sum(axis=1) / np.linalg.norm(towards, axis=1).clip(1e-12)
+        facing += (cosine > _FACING) & ~hidden
+    return before, facing
 
 
 def _against_cloud(
