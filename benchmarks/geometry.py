@@ -34,6 +34,7 @@ from relight.alignment import Similarity
 from relight.evaluate import evaluate
 from relight.fit import fit
 from relight.metrics import angles_deg
+from relight.plan import Action
 from relight.stage_cache import StageCache
 from relight.truth_cameras import align_to_truth
 
@@ -87,7 +88,9 @@ def main() -> None:
             session = folder / case.name.replace(" ", "_").replace(",", "")
             shutil.rmtree(session, ignore_errors=True)
             make_session(session, posed, args.portrait_a, case, args.frames)
-            fit(session)
+            # The given cloud is the head alone, for which a plan spares the masks: here they are wanted.
+            forced = {} if case.masks else {"masks": Action.RUN}
+            fit(session, forced=forced)
             results[case.name] = measure(session, args.portrait_a, case)
             print(json.dumps({case.name: summary(results[case.name])}, indent=1), flush=True)
     write_record(args.out, "geometry", PACKAGES, {"cases": results})

@@ -32,8 +32,8 @@ from relight.stage_cache import StageCache
 
 PACKAGES = ("torch", "numpy", "pycolmap", "opencv-contrib-python-headless")
 RATES_HZ = (2.0, 5.0, 11.0)
-SCALES = (0.5, 0.75)  # beside the middle rate at full size
-POINT_SHARES = (0.25, 0.5)
+SCALES = (0.5,)  # beside the middle rate at full size
+POINT_SHARES = (0.25,)
 FILM_S = 16.0
 
 

@@ -19,15 +19,18 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from capture.atomic import atomic_write
 from capture.json_fields import parse_json
 from capture.session import Session
+from capture.transfer import to_display
 from relight.derive import derive_scene
 from relight.devices import choose_device, describe_device
 from relight.errors import PlanError
-from relight.face import find_face, save_face
+from relight.face import FaceConfig, find_face, save_face
 from relight.geometry_plan import GEOMETRY_STAGES, GeometryConfig, candidates
 from relight.photometric import SolveConfig, solve
 from relight.plan import Action, Decision, Plan
@@ -99,7 +102,7 @@ def fit(
     config = SolveConfig(mirror=plan.runs("face_prior"))
     folder = opened.portraits_dir / name
     cache = StageCache(opened)
-    key = _solve_key(opened, cache, plan, config, torch_device)
+    key = _solve_key(opened, cache, plan, config, geometry.face, torch_device)
     if not fresh and _is_current(folder, key):
         return folder
     with stages.follow(progress) as told:
@@ -114,7 +117,7 @@ def fit(
 
     if plan.runs("face_prior"):
         with stages.stage("face"):
-            plan = plan.with_decision(_find_face(opened, portrait, progress))
+            plan = plan.with_decision(_find_face(opened, portrait, geometry.face, progress))
 
     folder.mkdir(parents=True, exist_ok=True)
     for outdated in ("evaluation.json", "config.json"):  # they belong to the portrait that is replaced now
@@ -135,10 +138,17 @@ def fit(
     return folder
 
 
-def _find_face(session: Session, portrait: Portrait, progress: Progress) -> Decision:
+def _find_face(session: Session, portrait: Portrait, config: FaceConfig, progress: Progress) -> Decision:
     """Finds the face of a solved portrait and keeps it in the session's scene folder."""
     progress("face", 0.0)
     cameras = session.load_scene_cameras()
+    records = {record.index: record for record in session.frames}
+
+    def load_srgb(index: int) -> NDArray[np.uint8]:
+        """A frame as a landmark model is used to: 8-bit sRGB."""
+        display = to_display(np.clip(session.load_radiance(records[index]), 0.0, 1.0))
+        return np.rint(255.0 * display).astype(np.uint8)
+
     result = find_face(
         portrait.points.cpu().double().numpy(),
         portrait.normals_world.cpu().double().numpy(),
@@ -148,7 +158,9 @@ def _find_face(session: Session, portrait: Portrait, progress: Progress) -> Deci
             for record in candidates(session.frames)
             if record.index in cameras
         },
+        config=config,
         confidence=portrait.confidence.cpu().double().numpy(),
+        load_srgb=load_srgb,
         rotation_deg=session.info["image"]["rotation_deg"],
         progress=progress,
     )
@@ -161,12 +173,22 @@ def _find_face(session: Session, portrait: Portrait, progress: Progress) -> Deci
 
 
 def _solve_key(
-    session: Session, cache: StageCache, plan: Plan, config: SolveConfig, device: torch.device
+    session: Session,
+    cache: StageCache,
+    plan: Plan,
+    config: SolveConfig,
+    face: FaceConfig,
+    device: torch.device,
 ) -> str:
     """Of all that a portrait depends on."""
     fitted = frozenset(plan.frames)
     frames = [record for record in session.frames if record.index in fitted]
-    settings = {**asdict(config), "undistort": plan.runs("undistortion"), "device": describe_device(device)}
+    settings = {
+        **asdict(config),
+        "face": asdict(face),
+        "undistort": plan.runs("undistortion"),
+        "device": describe_device(device),
+    }
     inputs = [*(cache.identity(stage) for stage in ("poses", "cloud", "masks")), installed_version()]
     return cache.key("solve", settings, frames, inputs)
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,10 +17,11 @@ from capture.cameras import Camera
 from capture.frame_record import FrameRecord
 from capture.ply import PointCloud
 from capture.session import Session
+from relight.face import FaceConfig
 from relight.masks import MaskConfig
 from relight.plan import Action, Decision
 from relight.sfm import SfmConfig
-from relight.stage_cache import StageCache
+from relight.stage_cache import StageCache, hash_files
 from relight.stereo import StereoConfig
 
 GEOMETRY_STAGES = ("poses", "cloud", "masks", "scale")
@@ -28,13 +30,16 @@ GEOMETRY_STAGES = ("poses", "cloud", "masks", "scale")
 FEWEST_POSES = 8
 """Frames under which a path around a head has no two neighbours that see the same part of it."""
 
+_STANDING = (Action.GIVEN, Action.KEPT)  # what is built on them need not be built again
+
 HEAD_SHARE = 0.6
 """A given cloud whose points all lie within this share of the cameras' distance holds no room."""
 
 # Seconds on two idle cores, in round numbers (docs/results.md).
 _SECONDS_PER_POSE = 0.6
-_SECONDS_PER_DEPTH_MAP_MEGAPIXEL = 18.0
-_SECONDS_PER_MASK = 0.4
+_SECONDS_PER_DEPTH_MAP = 14.0  # and megapixel
+_SECONDS_PER_MASK = 0.3
+_SECONDS_FOR_SCALE = 5.0
 
 
 @dataclass(frozen=True)
@@ -44,25 +49,29 @@ class GeometryConfig:
     sfm: SfmConfig = field(default_factory=SfmConfig)
     stereo: StereoConfig = field(default_factory=StereoConfig)
     masks: MaskConfig = field(default_factory=MaskConfig)
+    face: FaceConfig = field(default_factory=FaceConfig)
 
 
 @dataclass(frozen=True, eq=False)
 class GeometryPlan:
-    """Decisions on poses, cloud, masks and scale, with the keys under which results are kept.
+    """Decisions on poses, cloud, masks and scale.
 
     Attributes:
         poses: Where the cameras come from.
         cloud: Where the points come from.
         masks: Where the masks come from, or why there are none.
         scale: What the unit of length is.
-        estimated_s: What is to be found should take this long.
     """
 
     poses: Decision
     cloud: Decision
     masks: Decision
     scale: Decision
-    estimated_s: float
+
+    @property
+    def estimated_s(self) -> float:
+        """What is to be found should take this long."""
+        return sum(each.estimated_s for each in (self.poses, self.cloud, self.masks, self.scale))
 
 
 def candidates(frames: Sequence[FrameRecord]) -> list[FrameRecord]:
@@ -88,6 +97,8 @@ def stage_key(
     identities = [cache.identity(name) for name in inputs]
     if stage in ("poses", "cloud") and cache.is_given("masks"):
         identities.append(cache.identity("masks"))  # given masks help to find both
+    if stage == "masks" and config.masks.u2net:
+        identities.append(hash_files([Path(config.masks.u2net)]))
     return cache.key(stage, settings, frames, identities), settings
 
 
@@ -109,60 +120,84 @@ def plan_geometry(
         cloud: The session's points, as far as there are.
         forced: Decisions to turn round.
     """
-    seconds = 0.0
     frames = candidates(session.frames)
 
     def is_current(stage: str) -> bool:
         record = cache.record(stage)
         return record is not None and record.key == stage_key(stage, cache, config, frames)[0]
 
-    if poses and cache.is_given("poses"):
-        posed = _given_poses(session, poses)
-    elif is_current("poses"):
-        posed = Decision("poses", Action.KEPT, _found_poses(cache), "structure from motion")
-    elif len(frames) < FEWEST_POSES:
-        posed = Decision(
-            "poses",
+    posed = _poses(session, cache, config, frames, poses, is_current("poses"))
+    standing = posed.action in _STANDING
+    points = _cloud(cache, config, frames, posed, cloud, standing and is_current("cloud"))
+    standing = standing and points.action in _STANDING
+    current = standing and is_current("masks")
+    masks = _masks(session, cache, config, frames, poses, cloud, points, current, forced.get("masks"))
+    standing = standing and masks.action is not Action.RUN
+    return GeometryPlan(posed, points, masks, _scale(cache, posed, standing and is_current("scale")))
+
+
+def _poses(
+    session: Session,
+    cache: StageCache,
+    config: GeometryConfig,
+    frames: Sequence[FrameRecord],
+    poses: Mapping[int, Camera],
+    current: bool,
+) -> Decision:
+    name = "poses"
+    if poses and cache.is_given(name):
+        kept = sum(record.usable for record in session.frames)
+        return Decision(
+            name, Action.GIVEN, f"poses of {len(poses)} frames ({kept} usable)", "structure from motion"
+        )
+    if current:
+        return Decision(name, Action.KEPT, _found_poses(cache), "structure from motion")
+    if len(frames) < FEWEST_POSES:
+        return Decision(
+            name,
             Action.REFUSE,
             f"{len(frames)} usable frames are too few to find the camera poses in; film for twenty seconds "
             f"while you walk around the head ({FEWEST_POSES} frames are needed at least), or import poses",
         )
-    else:
-        posed = Decision("poses", Action.RUN, f"none given: structure from motion over {len(frames)} frames")
-        seconds += _SECONDS_PER_POSE * len(frames)
-    standing = posed.action in (Action.GIVEN, Action.KEPT)
-
-    if cloud is not None and cache.is_given("cloud"):
-        points = Decision("cloud", Action.GIVEN, f"{len(cloud.points):,} points", "dense stereo")
-        if posed.action is Action.RUN:
-            points = Decision(
-                "cloud",
-                Action.REFUSE,
-                f"a cloud of {len(cloud.points):,} points is given without the poses it belongs to; import "
-                "both, or neither",
-            )
-    elif cloud is not None and standing and is_current("cloud"):
-        found = f"{len(cloud.points):,} points found before from the same frames"
-        points = Decision("cloud", Action.KEPT, found, "dense stereo")
-    else:
-        points = Decision("cloud", Action.RUN, "none given: multi-view stereo of the head")
-        megapixels = sum(record.width * record.height for record in frames) / 1e6
-        seconds += _SECONDS_PER_DEPTH_MAP_MEGAPIXEL * megapixels * 0.4  # two of five frames have a depth map
-    standing = standing and points.action in (Action.GIVEN, Action.KEPT)
-
-    masks = _masks(
-        session, cache, frames, poses, cloud, points, standing and is_current("masks"), forced.get("masks")
-    )
-    if masks.action is Action.RUN:
-        seconds += _SECONDS_PER_MASK * len(frames)
-    standing = standing and masks.action is not Action.RUN
-    return GeometryPlan(posed, points, masks, _scale(cache, posed, standing and is_current("scale")), seconds)
-
-
-def _given_poses(session: Session, poses: Mapping[int, Camera]) -> Decision:
-    kept = sum(record.usable for record in session.frames)
     return Decision(
-        "poses", Action.GIVEN, f"poses of {len(poses)} frames ({kept} usable)", "structure from motion"
+        name,
+        Action.RUN,
+        f"none given: structure from motion over {len(frames)} frames",
+        estimated_s=_SECONDS_PER_POSE * len(frames),
+        settings=asdict(config.sfm),
+    )
+
+
+def _cloud(
+    cache: StageCache,
+    config: GeometryConfig,
+    frames: Sequence[FrameRecord],
+    posed: Decision,
+    cloud: PointCloud | None,
+    current: bool,
+) -> Decision:
+    name = "cloud"
+    if cloud is not None and cache.is_given(name):
+        if posed.action in _STANDING:
+            return Decision(name, Action.GIVEN, f"{len(cloud.points):,} points", "dense stereo")
+        return Decision(
+            name,
+            Action.REFUSE,
+            f"a cloud of {len(cloud.points):,} points is given without the poses it belongs to; import "
+            "both, or neither",
+        )
+    if cloud is not None and current:
+        found = f"{len(cloud.points):,} points found before from the same frames"
+        return Decision(name, Action.KEPT, found, "dense stereo")
+    maps = min(config.stereo.references, len(frames))
+    pixels = max((record.width * record.height for record in frames), default=0)
+    megapixels = min(pixels, config.stereo.working_px**2) / 1e6
+    return Decision(
+        name,
+        Action.RUN,
+        f"none given: multi-view stereo of the head, {maps} depth maps",
+        estimated_s=_SECONDS_PER_DEPTH_MAP * maps * megapixels,
+        settings=asdict(config.stereo),
     )
 
 
@@ -179,7 +214,8 @@ def _found_poses(cache: StageCache) -> str:
 def _masks(
     session: Session,
     cache: StageCache,
-    fitted: Sequence[FrameRecord],
+    config: GeometryConfig,
+    frames: Sequence[FrameRecord],
     poses: Mapping[int, Camera],
     cloud: PointCloud | None,
     points: Decision,
@@ -188,9 +224,9 @@ def _masks(
 ) -> Decision:
     name = "masks"
     if cache.is_given(name):
-        masked = sum(session.mask_path(record.index).is_file() for record in fitted)
+        masked = sum(session.mask_path(record.index).is_file() for record in frames)
         return Decision(
-            name, Action.GIVEN, f"masks of {masked} of {len(fitted)} frames clean the cloud", "segmentation"
+            name, Action.GIVEN, f"masks of {masked} of {len(frames)} frames clean the cloud", "segmentation"
         )
     if forced is Action.SKIP:
         return Decision(name, Action.SKIP, "every point of the cloud is taken for the head", forced=True)
@@ -201,7 +237,12 @@ def _masks(
     if current:
         return Decision(name, Action.KEPT, "found before from the same frames", "segmentation", forced=told)
     return Decision(
-        name, Action.RUN, "none given: what the flash lights, held together by the cloud", forced=told
+        name,
+        Action.RUN,
+        "none given: what the flash lights, held together by the cloud",
+        forced=told,
+        estimated_s=_SECONDS_PER_MASK * len(frames),
+        settings=asdict(config.masks),
     )
 
 
@@ -224,4 +265,9 @@ def _scale(cache: StageCache, posed: Decision, current: bool) -> Decision:
     record = cache.record(name)
     if current and record is not None:
         return Decision(name, Action.KEPT, f"metres by {record.report.get('source', 'a typical head')}")
-    return Decision(name, Action.RUN, "from markers of known size, the flash's offset or a typical head")
+    return Decision(
+        name,
+        Action.RUN,
+        "from markers of known size, the flash's offset or a typical head",
+        estimated_s=_SECONDS_FOR_SCALE,
+    )

@@ -45,6 +45,8 @@ class Decision:
         reason: For a person, one sentence without its full stop.
         saving: What a skip spares, where that is known.
         forced: Whether the user turned it round.
+        estimated_s: Seconds that the step should take on two cores; 0 where that is next to nothing.
+        settings: Resolved, of a step that has any.
     """
 
     name: str
@@ -52,6 +54,8 @@ class Decision:
     reason: str
     saving: str = ""
     forced: bool = False
+    estimated_s: float = 0.0
+    settings: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -113,6 +117,8 @@ class Plan:
                     "reason": decision.reason,
                     "saving": decision.saving,
                     "forced": decision.forced,
+                    "estimated_s": round(decision.estimated_s, 1),
+                    "settings": dict(decision.settings),
                 }
                 for decision in self.decisions
             ],

@@ -110,7 +110,7 @@ class StageCache:
             str(VERSIONS[stage]),
             json.dumps(settings, sort_keys=True, default=str),
             self._frame_hash(frames),
-            _hash_files([calibration]) if calibration.is_file() else "",
+            hash_files([calibration]) if calibration.is_file() else "",
             *inputs,
         ]
         return hashlib.blake2b("\0".join(parts).encode(), digest_size=16).hexdigest()
@@ -172,7 +172,7 @@ class StageCache:
         self._write()
 
     def _output(self, stage: str) -> str:
-        return _hash_files([file for path in self._outputs[stage] for file in _files(path)])
+        return hash_files([file for path in self._outputs[stage] for file in _files(path)])
 
     def _frame_hash(self, frames: Sequence[FrameRecord]) -> str:
         indices = tuple(record.index for record in frames)
@@ -181,7 +181,7 @@ class StageCache:
             for record in frames:
                 digest.update(f"{record.index} {record.flash} {record.pts_s}\0".encode())
                 if record.file is not None:
-                    digest.update(_hash_files([self._session.path / record.file]).encode())
+                    digest.update(hash_files([self._session.path / record.file]).encode())
             transfer = self._session.info["image"]["transfer"]
             self._frames[indices] = digest.hexdigest() + transfer
         return self._frames[indices]
@@ -238,7 +238,8 @@ def _files(path: Path) -> list[Path]:
     return sorted(file for file in path.glob("*") if file.is_file()) if path.is_dir() else []
 
 
-def _hash_files(files: Iterable[Path]) -> str:
+def hash_files(files: Iterable[Path]) -> str:
+    """Of names and contents, in the given order."""
     digest = hashlib.blake2b(digest_size=16)
     for file in files:
         digest.update(file.name.encode() + b"\0")

@@ -7,7 +7,7 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from relight.errors import PortraitError
+from relight.errors import PlanError, PortraitError
 
 if TYPE_CHECKING:
     from relight.geometry_plan import GeometryConfig
@@ -57,17 +57,41 @@ def add_geometry(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="weights of U2-Net as published (u2net.pth), to help with the masks; without, none are needed",
     )
+    group.add_argument(
+        "--face-landmarks",
+        type=Path,
+        metavar="FILE",
+        help="MediaPipe's face landmarker task file, to find the face with (needs the package mediapipe)",
+    )
+    group.add_argument(
+        "--position-maps",
+        type=Path,
+        metavar="DIR",
+        help="position maps of the face as PRNet gives them, NNNNNN.npy by frame",
+    )
 
 
 def chosen_geometry(args: argparse.Namespace) -> GeometryConfig:
-    """The settings that the flags of `add_geometry` ask for."""
+    """The settings that the flags of `add_geometry` ask for.
+
+    Raises:
+        PlanError: A file that a flag names is not there: said now, and not after minutes of work.
+    """
+    from relight.face import FaceConfig
     from relight.geometry_plan import GeometryConfig
     from relight.masks import MaskConfig
     from relight.sfm import SfmConfig
 
+    for flag in ("u2net", "face_landmarks", "position_maps"):
+        path = getattr(args, flag)
+        if path is not None and not path.exists():
+            raise PlanError(
+                f"{path} does not exist; name what --{flag.replace('_', '-')} shall use, or leave it out."
+            )
     sfm = SfmConfig() if args.marker_side is None else SfmConfig(marker_side_m=args.marker_side)
     masks = MaskConfig() if args.u2net is None else MaskConfig(u2net=str(args.u2net))
-    return GeometryConfig(sfm=sfm, masks=masks)
+    face = FaceConfig(model=str(args.face_landmarks or ""), maps=str(args.position_maps or ""))
+    return GeometryConfig(sfm=sfm, masks=masks, face=face)
 
 
 def add_max_seconds(parser: argparse.ArgumentParser) -> None:

@@ -18,6 +18,10 @@ SENTENCES = {
     "a preset to come": (["fit", "S", "--preset", "paper"], "still to come"),
     "no name for a folder": (["fit", "S", "--name", "../x"], "cannot be called"),
     "not to be forced": (["plan", "S", "--force", "poses=run"], "NAME one of undistortion"),
+    "weights that are not there": (
+        ["fit", "S", "--u2net", "no.pth"],
+        "no.pth does not exist; name what --u2net",
+    ),
     "nothing to fit": (["fit", "S"], "no frame is fully lit"),
     "a plan that refuses": (["plan", "S"], "no frame is fully lit"),
     "no portrait": (["report", "S"], "no portrait yet; make one with `relight fit S`"),
