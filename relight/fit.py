@@ -29,7 +29,7 @@ from capture.session import Session
 from capture.transfer import to_display
 from relight.derive import derive_scene
 from relight.devices import choose_device, describe_device
-from relight.errors import PlanError
+from relight.errors import GeometryError, PlanError
 from relight.face import FaceConfig, find_face, save_face
 from relight.geometry_plan import GEOMETRY_STAGES, GeometryConfig, candidates
 from relight.photometric import SolveConfig, solve
@@ -39,11 +39,17 @@ from relight.portrait import Portrait
 from relight.previews import write_previews
 from relight.report import write_report
 from relight.scene import load_scene
+from relight.self_check import SelfCheck, check_portrait
 from relight.stage_cache import StageCache
 from relight.stages import Progress, Stages, memory_summary, no_progress
 from relight.version import installed_version
 
 PRESETS = ("solve",)
+REFUSED_DB, REFUSED_COVER = 21.0, 0.7
+"""A portrait under these shows something else than its frames (right ones have 30 dB and more, and 0.95)."""
+
+DOUBTED_DB, DOUBTED_COVER = 25.0, 0.85
+
 PRESETS_TO_COME = ("fast", "balanced", "paper")
 
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,79}")
@@ -115,6 +121,9 @@ def fit(
         )
         portrait = solve(scene, config, told)
 
+    with stages.stage("check"):
+        check = check_portrait(portrait, scene)
+        warnings = _judged(check, found=cache.record("poses") is not None)
     if plan.runs("face_prior"):
         with stages.stage("face"):
             plan = plan.with_decision(_find_face(opened, portrait, geometry.face, progress))
@@ -128,14 +137,39 @@ def fit(
     with stages.stage("previews"):
         write_previews(portrait, opened, folder / "previews", progress)
     metrics = _metrics(plan, portrait, stages, torch_device)
-    _write_json(
-        folder / "metrics.json", {**metrics, "geometry": cache.reports(), "warnings": cache.warnings()}
-    )
+    metrics |= {
+        "check": asdict(check),
+        "geometry": cache.reports(),
+        "warnings": [*cache.warnings(), *warnings],
+    }
+    _write_json(folder / "metrics.json", metrics)
     # Last, because its key says that all of the portrait is there.
     resolved = {"key": key, "preset": preset, "solve": asdict(config), "geometry": asdict(geometry)}
     _write_json(folder / "config.json", resolved)
     write_report(session, name)
     return folder
+
+
+def _judged(check: SelfCheck, *, found: bool) -> list[str]:
+    """Sentences about a portrait that does not show its own frames well.
+
+    Raises:
+        GeometryError: It does not show them at all, and rests on poses that were found: they are wrong.
+    """
+    said = (
+        f"the portrait gives its own frames back at {check.psnr_db:.1f} dB and covers "
+        f"{check.covered:.0%} of what was taken for the subject"
+    )
+    if found and not (check.psnr_db >= REFUSED_DB and check.covered >= REFUSED_COVER):
+        raise GeometryError(
+            f"What was found in these frames does not hold: {said} (needed: {REFUSED_DB:g} dB and "
+            f"{REFUSED_COVER:.0%}). The head moved, or the background shows too little: film again with a "
+            "still head before a background with things in it, put printed markers about the head, or give "
+            "poses."
+        )
+    if not (check.psnr_db >= DOUBTED_DB and check.covered >= DOUBTED_COVER):
+        return [f"Look twice: {said}; a head that moved, poses that are off or blur would show like that."]
+    return []
 
 
 def _find_face(session: Session, portrait: Portrait, config: FaceConfig, progress: Progress) -> Decision:

@@ -122,6 +122,8 @@ def _levels(
     if both.sum() < 20:
         return np.ones((len(places), values.shape[1]))
     own = values[sample[both]].cpu().double().numpy()
+    # A least squares near black may come out below it.
+    own, other = np.maximum(own, 0.0), np.maximum(other, 0.0)
     logs = np.log((own + _FLOOR) / (other[both] + _FLOOR)).clip(-np.log(_RATIO_LIMIT), np.log(_RATIO_LIMIT))
     tree = cKDTree(at[sample[both]])
     count = min(_RATIO_NEIGHBOURS, int(both.sum()))

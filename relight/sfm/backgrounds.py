@@ -23,6 +23,8 @@ _SAME_ROTATION_DEG = 1.0  # median, between the poses by everything and those by
 _SAME_PLACE = 0.04  # of the distance
 _LEAST_MATCHES = 300  # on either side, to judge by
 _ENOUGH = 0.9  # share of the keyframes
+_MORE_HELD = 0.1  # share of the matches on the head
+_LARGER_ERROR = 1.8
 
 
 def follow_the_head(search: Search, way: Way) -> tuple[Outcome, dict[str, Any], tuple[str, ...]]:
@@ -88,14 +90,27 @@ def follow_the_head(search: Search, way: Way) -> tuple[Outcome, dict[str, Any], 
             )
             outcome = replace(outcome, complaints=(*outcome.complaints, complaint))
         return outcome, about, ()
-    if outcome.usable and same_motion(whole, alone.sparse):
-        return outcome, about, ()
+    if outcome.usable:
+        held, _, _, _ = tracked_shares(alone.sparse, mapped, alone.pairs, subject, alone.cameras, config.seed)
+        about |= {"tracked_on_subject_alone": held}
+        if same_motion(whole, alone.sparse) or not _is_better(whole, on, alone.sparse, held):
+            return outcome, about, ()
     if comparable:
         freed, about_alone = solve(search, way, subject)
         if freed.usable and freed.registered >= alone.registered:
             alone, about["alone"] = freed, about_alone
     warning = "The head moves against the background: only features on the head were used."
     return alone, about | {"features_of": "subject"}, (warning,)
+
+
+def _is_better(whole: Sparse, on: float, alone: Sparse, held: float) -> bool:
+    """Whether the head alone tells another motion, and tells it truly.
+
+    A head alone is small and seen from afar: nearly the same pictures come of it turned inside out and moving
+    the other way, at the price of larger errors and fewer matches held. What is true of it holds more.
+    """
+    error, alone_error = (float(np.median(sparse.error_px)) for sparse in (whole, alone))
+    return held > on + _MORE_HELD and alone_error < _LARGER_ERROR * error
 
 
 def same_motion(first: Sparse, second: Sparse) -> bool:
