@@ -91,7 +91,7 @@ def test_nothing_known_and_everything_known_change_nothing():
 
 
 def test_values_a_little_below_black_stay_finite():
-    points, normals, pattern = ball()
+    points, normals, _ = ball()
     gone = hole(points)
     dark = torch.where(points[:, 1:2] > 0, -0.01, 0.02).repeat(1, 3)
     result = filled(points, normals, torch.where(gone[:, None], 0.0, dark), torch.where(gone, 0.0, 3.0))
