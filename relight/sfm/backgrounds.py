@@ -18,6 +18,7 @@ from relight.sfm.world import look_point
 
 # A reconstruction holds a smaller share of the matches on skin than on a wall, also where nothing moved.
 _PARTED = 0.75  # one side's share over the other's, below which the head alone is asked
+_HOLDS = 0.5  # share of a side's matches from which on its motion is that of the reconstruction
 _TORN = 0.5  # below which the head moved, even if it cannot be asked
 _SAME_ROTATION_DEG = 1.0  # median, between the poses by everything and those by the head alone
 _SAME_PLACE = 0.04  # of the distance
@@ -70,7 +71,7 @@ def follow_the_head(search: Search, way: Way) -> tuple[Outcome, dict[str, Any], 
     about |= {"tracked_on_subject": on, "tracked_off_subject": off, "matches_on_subject": matches_on}
     if matches_on < _LEAST_MATCHES or matches_off < _LEAST_MATCHES:
         return outcome, about, ()
-    parted = min(on, off) < _PARTED * max(on, off)
+    parted = min(on, off) < min(_PARTED * max(on, off), _HOLDS)
     if not parted and outcome.usable:
         return outcome, about, ()
     # With the lens that everything gave: a short arc of the head alone does not tell the focal length, and
