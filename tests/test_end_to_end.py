@@ -62,7 +62,8 @@ def test_the_portrait_has_everything_that_belongs_to_it(session):
         "previews/orbit.jpg",
     } <= files
     metrics = json.loads((folder / "metrics.json").read_text())
-    assert set(metrics["seconds"]) == {"plan", "read", "cloud", "observe", "solve", "save", "previews"}
+    stages = {"plan", "read", "cloud", "observe", "solve", "check", "face", "save", "previews"}
+    assert set(metrics["seconds"]) == stages
     assert metrics["points"] > 1000
     assert metrics["frames"] == len(json.loads((folder / "plan.json").read_text())["frames"])
 

