@@ -40,6 +40,8 @@ from relight.stages import Progress, Stages, no_progress
 from relight.stereo import DenseCloud, dense_cloud
 from relight.stereo.completion import complete_with_masks
 
+_POINTS_FOR_SCALE = 60_000  # a head's breadth needs no more, and memory goes with points times frames
+
 
 def derive_scene(
     session: Session,
@@ -208,8 +210,10 @@ def _scale_of(session: Session, cameras: Mapping[int, Camera], progress: Progres
     cloud = read_ply(session.points_path)
     assert cloud.normals is not None  # of a cloud that was found
     scene = load_scene(session, frames=sorted(cameras), progress=progress)
-    spacing, _ = spacing_and_noise(cloud.points)
-    flash = flash_samples(scene, cloud.points, cloud.normals, spacing, progress)
+    some = slice(None, None, -(-len(cloud.points) // _POINTS_FOR_SCALE))
+    points, normals = cloud.points[some], cloud.normals[some]
+    spacing, _ = spacing_and_noise(points)
+    flash = flash_samples(scene, points, normals, spacing, progress)
     offset = load_calibration(session.calibration_path).flash_offset_cam_m
     return find_scale(
         flash.points,
