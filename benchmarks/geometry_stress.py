@@ -4,8 +4,8 @@
 
 Every scene of `geometry_scenes` goes through the whole fit, each in a process of its own, small ones unless
 --full is given. A result is called wrong where the poses are off by more than half a degree or a fiftieth of
-the distance, or the portrait shows the validation views at less than 22 dB: the worst that can happen, for
-nothing said so.
+the distance, or the portrait shows the validation views at less than 22 dB, and nothing said so: the worst
+that can happen. Where a warning says that it may be off, it is called doubted.
 """
 
 from __future__ import annotations
@@ -86,7 +86,10 @@ def outcome(name: str, quick: bool) -> dict[str, Any]:
             measured = evaluate(made.session, made.truth)
         except RelightError as refusal:
             return {**about, "outcome": "refusal", "kind": type(refusal).__name__, "said": str(refusal)}
-        cache = StageCache(Session.open(made.session))
+        session = Session.open(made.session)
+        cache = StageCache(session)
+        metrics = json.loads((session.portraits_dir / "solve" / "metrics.json").read_text())
+        said = metrics["warnings"]
         poses = measured["alignment"]
         captured = measured.get("captured", {}).get("psnr_db")
         wrong = (
@@ -96,7 +99,7 @@ def outcome(name: str, quick: bool) -> dict[str, Any]:
         )
         return {
             **about,
-            "outcome": "wrong" if wrong else "result",
+            "outcome": ("doubted" if any(map(_doubts, said)) else "wrong") if wrong else "result",
             "registered": cache.reports()["poses"].get("registered"),
             "rotation_median_deg": poses["rotation_median_deg"],
             "rotation_worst_deg": poses["rotation_worst_deg"],
@@ -104,8 +107,13 @@ def outcome(name: str, quick: bool) -> dict[str, Any]:
             "captured_db": captured,
             "normals_deg": measured.get("normals", {}).get("mean_deg"),
             "mask_iou": measured.get("mask", {}).get("iou"),
-            "warnings": cache.warnings(),
+            "warnings": said,
         }
+
+
+def _doubts(sentence: str) -> bool:
+    """Whether a warning tells the user that poses or portrait may be off."""
+    return any(word in sentence for word in ("Look twice", "poses are off", "may be off", "moves against"))
 
 
 if __name__ == "__main__":

@@ -27,6 +27,11 @@ _ENOUGH = 0.9  # share of the keyframes
 _MORE_HELD = 0.1  # share of the matches on the head
 _LARGER_ERROR = 1.8
 
+_PLAIN = (
+    "The background shows next to nothing to hold on to, so the poses rest on the head alone and may be off "
+    "by degrees; shelves, pictures or a few printed markers about the head (--marker-side) make them sure."
+)
+
 
 def follow_the_head(search: Search, way: Way) -> tuple[Outcome, dict[str, Any], tuple[str, ...]]:
     """Tries one way, and the head alone where the background moves on its own.
@@ -70,7 +75,7 @@ def follow_the_head(search: Search, way: Way) -> tuple[Outcome, dict[str, Any], 
     )
     about |= {"tracked_on_subject": on, "tracked_off_subject": off, "matches_on_subject": matches_on}
     if matches_on < _LEAST_MATCHES or matches_off < _LEAST_MATCHES:
-        return outcome, about, ()
+        return outcome, about, (_PLAIN,) if matches_off < _LEAST_MATCHES else ()
     parted = min(on, off) < min(_PARTED * max(on, off), _HOLDS)
     if not parted and outcome.usable:
         return outcome, about, ()
