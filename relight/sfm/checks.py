@@ -20,7 +20,7 @@ MOST_ERROR_PX = 1.5
 LEAST_POINTS = 60
 LEAST_TRACK = 2.5
 LEAST_ANGLE_DEG = 1.5
-LEAST_FAN_DEG = 4.0
+LEAST_FAN_DEG = 8.0  # from less no head can be made, and what is near trades with what is small
 LEAST_AGREEING_PAIRS = 0.7
 
 _PAIR_ERROR_PX = 2.5
