@@ -3,4 +3,3 @@
 from relight.masks.config import MaskConfig as MaskConfig
 from relight.masks.config import MaskResult as MaskResult
 from relight.masks.find import find_masks as find_masks
-from relight.masks.rough import rough_foreground as rough_foreground
