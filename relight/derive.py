@@ -19,6 +19,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from calib.calibration import load_calibration
 from capture.cameras import Camera
@@ -215,10 +216,12 @@ def _scale_of(session: Session, cameras: Mapping[int, Camera], progress: Progres
     spacing, _ = spacing_and_noise(points)
     flash = flash_samples(scene, points, normals, spacing, progress)
     offset = load_calibration(session.calibration_path).flash_offset_cam_m
+    # What the flash says is known of a few of the points; a nose needs all of them.
+    _, nearest = cKDTree(flash.points).query(points, workers=-1)
     return find_scale(
-        flash.points,
-        flash.normals,
-        np.repeat(flash.albedo[:, None], 3, axis=1),
+        points,
+        normals,
+        np.repeat(flash.albedo[nearest][:, None], 3, axis=1),
         cameras,
         flash=flash,
         flash_offset_cam_m=None if offset is None else np.asarray(offset.value),
