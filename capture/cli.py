@@ -51,8 +51,8 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _capture(args: argparse.Namespace) -> None:
-    from capture.devices import open_rig
     from capture.recorder import record
+    from capture.rig_devices import open_rig
 
     with StageProgress() as progress:
         progress("open the rig", 0.0)

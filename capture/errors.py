@@ -9,6 +9,12 @@
         ├── CalibrationError a calibration.json that cannot be used
         ├── TaggingError     the flash state of the frames cannot be told
         └── DeviceError      a camera or flash that does not answer as it must
+            ├── CameraError          ... of a camera
+            │   ├── CameraGoneError      it is not there any more
+            │   └── CameraTimeoutError   no frame came in time; also a TimeoutError
+            └── FlashError           ... of a flash
+                ├── FlashGoneError       it is not there any more, or its link is dead
+                └── FlashResetError      it has restarted; its light is off
 
 Every message is one sentence for the user: what is wrong, with its name, value and limit, and what to do
 next. Commands print it and exit with code 1.
@@ -49,3 +55,27 @@ class TaggingError(CaptureError):
 
 class DeviceError(CaptureError):
     """A camera or a flash does not answer as it must."""
+
+
+class CameraError(DeviceError):
+    """A camera does not answer as it must."""
+
+
+class CameraGoneError(CameraError):
+    """The camera is not there any more."""
+
+
+class CameraTimeoutError(CameraError, TimeoutError):
+    """No frame came in time."""
+
+
+class FlashError(DeviceError):
+    """A flash does not answer as it must."""
+
+
+class FlashGoneError(FlashError):
+    """The flash is not there any more, or its link is dead."""
+
+
+class FlashResetError(FlashError):
+    """The flash has restarted; its light is off."""

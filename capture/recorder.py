@@ -14,11 +14,11 @@ import cv2
 
 from capture.calibration_file import Quantity, write_calibration_entries
 from capture.cameras import Camera
-from capture.devices import CaptureRig, RigDescription
 from capture.frame_record import FrameRecord
 from capture.importers.options import ImportOptions, Progress
 from capture.importers.video_records import select_records
 from capture.ply import write_ply
+from capture.rig_devices import CaptureRig, RigDescription
 from capture.selection import measure_sharpness
 from capture.session import Session
 from capture.tagging import ProfileAccumulator, TagResult, tag

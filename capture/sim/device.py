@@ -10,9 +10,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from capture.devices import CapturedFrame, RigDescription
 from capture.errors import DeviceError
 from capture.ply import PointCloud
+from capture.rig_devices import CapturedFrame, RigDescription
 from capture.sim.cloud import stereo_cloud
 from capture.sim.config import RigConfig
 from capture.sim.rig import Rig
