@@ -1,0 +1,1 @@
+"""The flash with the reference firmware on a serial port."""
