@@ -57,18 +57,24 @@ class Live:
         raise AssertionError("no such packet came")
 
 
+@pytest.fixture
+def edges_file(tmp_path):
+    return tmp_path / "edges.txt"
+
+
 @pytest.fixture(params=["double", "simavr"])
-def live(request):
+def live(request, edges_file):
     if request.param == "double":
-        device = Live(request.getfixturevalue("host_build") / "flash_double")
+        device = Live(request.getfixturevalue("host_build") / "flash_double", "--edges", edges_file)
     else:
         image = request.getfixturevalue("avr_build") / "flash.elf"
-        device = Live(request.getfixturevalue("runner"), image)
+        device = Live(request.getfixturevalue("runner"), image, "--edges", edges_file)
     yield device
     device.close()
 
 
-def test_a_host_shakes_hands_and_lights_the_lamp_once(live):
+def light_once(live):
+    """(EVENT on, EVENT off, tick_hz) of a flash of 50 ms."""
     hello = live.until(lambda p: p.seq == 1, repeat=encode(Hello.from_host("live"), 1))
     assert hello.boot_nonce
     # The device refuses its first second; the numbers are new ones until it obeys.
@@ -81,6 +87,26 @@ def test_a_host_shakes_hands_and_lights_the_lamp_once(live):
         time.sleep(0.05)
     on = live.until(lambda p: isinstance(p.message, Event) and p.message.edge == 1)
     off = live.until(lambda p: isinstance(p.message, Event) and p.message.edge == 0)
+    return on, off, hello.tick_hz
+
+
+def test_a_host_shakes_hands_and_lights_the_lamp_once(live):
+    on, off, tick_hz = light_once(live)
     assert on.pulse == off.pulse == 1
     # In ticks of the device, whose clock does not know how busy this machine is: exact but for two roundings.
-    assert (off.tick - on.tick) / hello.tick_hz == pytest.approx(0.05, abs=8e-6)
+    assert (off.tick - on.tick) / tick_hz == pytest.approx(0.05, abs=8e-6)
+
+
+def test_the_edges_file_has_the_lamp_by_the_clock_of_the_system(live, edges_file):
+    before_ns = time.clock_gettime_ns(time.CLOCK_MONOTONIC)
+    on, off, tick_hz = light_once(live)
+    after_ns = time.clock_gettime_ns(time.CLOCK_MONOTONIC)
+    lines = [line.split() for line in edges_file.read_text().splitlines()]
+    times_ns = [int(when) for when, _ in lines]
+    assert times_ns == sorted(times_ns)
+    (on_ns, off_ns) = (int(when) for when, what in lines if what != "t")
+    assert before_ns < on_ns < off_ns < after_ns
+    # The file's edges and the firmware's own ticks are the same two moments, but for their roundings.
+    assert (off_ns - on_ns) * 1e-9 == pytest.approx((off.tick - on.tick) / tick_hz, abs=8e-6)
+    assert sum(what == "t" for _, what in lines) > 10
+    assert lines[-1][1] == "t"

@@ -2,8 +2,8 @@
 
     transport.py   what a line is: write, read with a timeout, close
     link.py        commands and answers over it: numbers, repeats, resets, counters
-    device_clock.py  round trips -> the device's clock in the host's
+    device_clock.py   round trips -> device clock in host time
     flash.py       the FlashDevice made of them
 
-A serial port (`capture.devices.serial_flash`) and HID reports (`capture.devices.hid.firmware`) are transports.
+Transports are a serial port (`capture.devices.serial_flash`) and HID (`capture.devices.hid.firmware`).
 """

@@ -3,7 +3,7 @@
  * A test tool, in a process of its own: libsimavr is under the GPL and is linked with nothing of the product.
  * The protocol of this program is that of ports/host/flash_double.c, with times in processor cycles:
  *
- *     runner FLASH.elf [--step]
+ *     runner FLASH.elf [--edges FILE | --step]
  *     pty PATH CLOCK_HZ                first line out
  *     edge CYCLE 0|1                   the lamp pin, D9 or D10, exact to the cycle
  *     sent CYCLE BYTE                  (--trace) a byte begins to leave
@@ -11,6 +11,9 @@
  *     run US BYTES -> ok CYCLE SENT STACK   (--step) STACK is the lowest stack pointer so far
  *     reset                            the reset button
  *     hang                             the processor loops for ever with its interrupts off
+ *
+ * In real time the chip's clock runs linearly in CLOCK_MONOTONIC and never ahead of it: a byte that arrives is
+ * met no earlier than it was written, and one that leaves comes out no earlier than it was sent.
  */
 #define _GNU_SOURCE
 #include <fcntl.h>
@@ -41,11 +44,27 @@ static size_t waiting_from, waiting_to;
 static uint16_t lowest_stack = 0xFFFF;
 static avr_flashaddr_t hung_at;
 static uint8_t hung_over[2];
+static FILE *edges_file; /* null without --edges */
+static struct timespec start; /* when cycle 0 was */
+
+/* A line of the edges' file. */
+static void note(char what)
+{
+    if (!edges_file)
+        return;
+    fprintf(edges_file, "%llu %c\n",
+            start.tv_sec * 1000000000ULL + (unsigned long long)start.tv_nsec +
+                avr->cycle * 1000 / (avr->frequency / 1000000),
+            what);
+    fflush(edges_file);
+}
 
 static void set_lamp(int on)
 {
-    if (on != lit)
+    if (on != lit) {
         printf("edge %llu %d\n", (unsigned long long)avr->cycle, on);
+        note(on ? '1' : '0');
+    }
     lit = on;
 }
 
@@ -197,15 +216,34 @@ static void obey(const char *command)
     fflush(stdout);
 }
 
+/* Runs up to now. */
+static void catch_up(void)
+{
+    static avr_cycle_count_t noted;
+    struct timespec now;
+    clock_gettime(CLOCK_MONOTONIC, &now);
+    run_until((avr_cycle_count_t)((now.tv_sec - start.tv_sec) * 1e6 + (now.tv_nsec - start.tv_nsec) / 1e3) *
+              (avr->frequency / 1000000));
+    if (avr->cycle - noted > avr->frequency / 200) { /* each 5 ms */
+        noted = avr->cycle;
+        note('t');
+    }
+    fflush(stdout);
+}
+
 static void live(void)
 {
-    struct timespec start, now;
+    avr_cycle_count_t heard = 0;
     clock_gettime(CLOCK_MONOTONIC, &start);
     for (;;) {
         struct pollfd waits[2] = {{.fd = line_fd, .events = POLLIN}, {.fd = 0, .events = POLLIN}};
+        /* While an answer is under way, so often that what leaves the chip does not wait for its reader. */
+        struct timespec pause = {0, avr->cycle - heard < avr->frequency / 50 ? 100000 : 1000000};
         char command[128];
-        poll(waits, 2, 1);
-        read_line();
+        ppoll(waits, 2, &pause, 0);
+        catch_up();
+        if (read_line())
+            heard = avr->cycle;
         if (waits[1].revents) {
             ssize_t count = read(0, command, sizeof command - 1);
             if (count <= 0)
@@ -213,11 +251,6 @@ static void live(void)
             command[count] = 0;
             obey(command);
         }
-        clock_gettime(CLOCK_MONOTONIC, &now);
-        run_until(
-            (avr_cycle_count_t)((now.tv_sec - start.tv_sec) * 1e6 + (now.tv_nsec - start.tv_nsec) / 1e3) *
-            (avr->frequency / 1000000));
-        fflush(stdout);
     }
 }
 
@@ -231,9 +264,11 @@ int main(int argc, char **argv)
     for (int i = 2; i < argc; i++) {
         step |= !strcmp(argv[i], "--step");
         trace |= !strcmp(argv[i], "--trace");
+        if (!strcmp(argv[i], "--edges") && i + 1 < argc && !(edges_file = fopen(argv[++i], "a")))
+            return perror(argv[i]), 1;
     }
     if (argc < 2 || elf_read_firmware(argv[1], &firmware))
-        return fprintf(stderr, "usage: runner FLASH.elf [--step] [--trace]\n");
+        return fprintf(stderr, "usage: runner FLASH.elf [--edges FILE | --step] [--trace]\n");
     avr = avr_make_mcu_by_name("atmega328p");
     avr_init(avr);
     avr->log = LOG_NONE;

@@ -1,16 +1,20 @@
 /* The device as a program behind a pseudo-terminal: a quick double for a host's tests and for trying things
  * out.
  *
- *     flash_double                  lives in real time; prints the terminal to open
+ *     flash_double [--edges FILE]   lives in real time; prints the terminal to open
  *     flash_double --step [--clock TICK]   its time stands still but for commands on standard input
  *
  * First line out:    pty PATH CLOCK_HZ
  * An edge of the lamp:   edge TICK 0|1
+ * FILE gets, appended and flushed, what a camera beside the lamp needs to know, in ns of CLOCK_MONOTONIC:
+ *     NS 0|1                 an edge of the lamp; the device's clock runs linearly in the system's
+ *     NS t                   each 10 ms or sooner: all edges up to then have been written
  * Lines in:
- *     run US BYTES   (--step only) waits until BYTES in all have come through the terminal, takes them, lets
- * US microseconds pass; answers "ok TICK SENT": bytes sent through the terminal in all reset          the
- * reset button break          the timer no longer makes the edge off (to test the guard above it) End of
- * input ends the program.
+ *     run US BYTES           (--step only) waits until BYTES in all have come through the terminal, takes
+ *                            them, lets US microseconds pass; answers "ok TICK SENT": bytes sent in all
+ *     reset                  the reset button
+ *     break                  the timer no longer makes the edge off (to test the guard above it)
+ * End of input ends the program.
  */
 #include <errno.h>
 #include <fcntl.h>
@@ -29,6 +33,8 @@
 
 static int line_fd;
 static unsigned long received, sent;
+static FILE *edges_file; /* null without --edges */
+static struct timespec start; /* when the device's clock was 0 */
 
 static void fail(const char *what)
 {
@@ -36,10 +42,21 @@ static void fail(const char *what)
     exit(1);
 }
 
+/* A line of the edges' file; a tick is 1 us. */
+static void note(tick_t tick, char what)
+{
+    unsigned long long ns = (unsigned long long)start.tv_sec * 1000000000ULL;
+    if (!edges_file)
+        return;
+    fprintf(edges_file, "%llu %c\n", ns + (unsigned long long)start.tv_nsec + tick * 1000, what);
+    fflush(edges_file);
+}
+
 static void print_edge(const edge_t *edge)
 {
     printf("edge %llu %d\n", (unsigned long long)edge->tick, edge->on);
     fflush(stdout);
+    note(edge->tick, edge->on ? '1' : '0');
 }
 
 static void write_line(uint8_t byte)
@@ -127,24 +144,24 @@ static void obey(const char *command)
 }
 
 /* Moves the device's clock to the system's. */
-static void catch_up(const struct timespec *start)
+static void catch_up(void)
 {
     struct timespec now;
     clock_gettime(CLOCK_MONOTONIC, &now);
-    host_advance((tick_t)((now.tv_sec - start->tv_sec) * 1000000LL + (now.tv_nsec - start->tv_nsec) / 1000));
+    host_advance((tick_t)((now.tv_sec - start.tv_sec) * 1000000LL + (now.tv_nsec - start.tv_nsec) / 1000));
+    note(port_now(), 't');
 }
 
 static void live(void)
 {
     char command[128];
-    struct timespec start;
     clock_gettime(CLOCK_MONOTONIC, &start);
     for (;;) {
         struct pollfd waits[2] = {{0, POLLIN, 0}, {0, POLLIN, 0}};
-        int until_edge_ms = (int)((host_next_edge(port_now() + TICK_HZ / 100) - port_now()) / 1000);
+        int until_edge_ms = (int)((host_next_edge(port_now() + TICK_HZ / 200) - port_now()) / 1000);
         waits[0].fd = line_fd;
         poll(waits, 2, until_edge_ms);
-        catch_up(&start);
+        catch_up();
         if (waits[0].revents & POLLIN)
             read_line();
         if (waits[1].revents) {
@@ -168,8 +185,11 @@ int main(int argc, char **argv)
             step = true;
         } else if (!strcmp(argv[i], "--clock") && i + 1 < argc) {
             host_set_clock(strtoull(argv[++i], 0, 10));
+        } else if (!strcmp(argv[i], "--edges") && i + 1 < argc) {
+            if (!(edges_file = fopen(argv[++i], "a")))
+                fail(argv[i]);
         } else {
-            fprintf(stderr, "usage: flash_double [--step [--clock TICK]]\n");
+            fprintf(stderr, "usage: flash_double [--edges FILE | --step [--clock TICK]]\n");
             return 2;
         }
     }
