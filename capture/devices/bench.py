@@ -69,7 +69,9 @@ class Bench:
     Attributes:
         clock: Of everything here.
         light: What simulated lamps shine with; real cameras do not look at it.
+        walk_s: How long the hand of a simulated camera takes around the head.
     """
 
     clock: Clock = field(default_factory=MonotonicClock)
     light: LampLight = field(default_factory=LampLight)
+    walk_s: float = 16.0

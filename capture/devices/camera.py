@@ -13,12 +13,13 @@ import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from types import TracebackType
-from typing import Any, Protocol, Self
+from typing import Any, Protocol, Self, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from capture.cameras import Camera
+from capture.ply import PointCloud
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -217,6 +218,27 @@ class CameraDevice(Protocol):
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Closes it."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class KnownScene:
+    """What a rig that knows its scene says beyond its frames' poses.
+
+    Attributes:
+        flash_offset_cam_m: [3] where the flash sits, in the camera's axes.
+        cloud: The scene's points; None = it does not tell.
+    """
+
+    flash_offset_cam_m: tuple[float, float, float]
+    cloud: PointCloud | None
+
+
+@runtime_checkable
+class KnowsScene(Protocol):
+    """A camera that knows what it films, as a simulated one does."""
+
+    def known_scene(self) -> KnownScene | None:
+        """What it tells; None = it keeps it to itself."""
 
 
 def mean_linear(rgb: NDArray[np.uint8], transfer: str) -> float:

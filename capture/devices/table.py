@@ -41,10 +41,16 @@ _CAMERA_PATH = re.compile(r"/dev/(video|v4l/)")
 _PORT_SCHEMES = ("hwgrep", "socket", "rfc2217", "spy", "alt", "loop")
 
 
-def open_bench(camera_url: str, flash_url: str) -> Bench:
-    """The desk of two devices: in simulated time when both are simulated."""
+def open_bench(camera_url: str, flash_url: str, duration_s: float = 16.0) -> Bench:
+    """The desk of two devices: in simulated time when both are simulated.
+
+    Args:
+        camera_url: See `open_camera`.
+        flash_url: See `open_flash`.
+        duration_s: Of the recording: the hand of a simulated camera takes as long around the head.
+    """
     schemes = {camera_scheme(camera_url)[0], flash_scheme(flash_url)[0]}
-    return Bench(VirtualClock() if schemes <= _VIRTUAL else MonotonicClock())
+    return Bench(VirtualClock() if schemes <= _VIRTUAL else MonotonicClock(), walk_s=duration_s)
 
 
 def open_camera(url: str, bench: Bench | None = None) -> CameraDevice:

@@ -1,84 +1,101 @@
-"""The simulated rig as a device: `sim:`, `sim:seed=3`, `sim:coarse`; camera and flash are one.
+"""The simulated rig as devices: `sim:seed=3;coarse` is a camera, `sim:` a flash.
 
-Beyond a real device it knows its poses and a point cloud, so that its sessions can be fitted as they are.
+They model rolling shutter, noise, jitter of stamps, lost frames, the lamp's rise, fall and droop, and by
+settings the accidents of real devices. They do not model a camera's automatics (`fake-v4l2:` has those),
+motion blur, compression, or a driver's finite buffers: frames wait until they are read, however late.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 
-import numpy as np
-
-from capture.errors import DeviceError
-from capture.ply import PointCloud
-from capture.rig_devices import CapturedFrame, RigDescription
-from capture.sim.cloud import stereo_cloud
+from capture.devices.bench import Bench, VirtualClock
+from capture.devices.url_options import parse_options
+from capture.errors import CameraError, FlashError
+from capture.sim.camera_device import CameraFaults, SimulatedCamera
 from capture.sim.config import RigConfig
-from capture.sim.rig import Rig
+from capture.sim.edge_file import EdgeFile
+from capture.sim.flash_device import FlashFaults, SimulatedFlash
+
+_CAMERA_OPTIONS = {
+    "seed": int,
+    "coarse": bool,
+    "fps": float,
+    "drop": float,
+    "unplug_s": float,
+    "drift_s": float,
+    "edges": str,
+    "unposed": bool,
+}
+_FLASH_OPTIONS = {"missed": float, "jitter_ms": float, "unplug_s": float, "reset_s": float, "seed": int}
 
 
-def open_rig(camera: str, flash: str, duration_s: float) -> SimulatedRig:
-    """The rig of `sim:CAMERA` and `sim:FLASH`; the flash has no settings of its own."""
-    if flash:
-        raise DeviceError(f"sim:{flash} is not understood; the simulated flash is sim: without settings.")
-    config = _config(camera)
-    return SimulatedRig(replace(config, path=replace(config.path, duration_s=duration_s)))
+def open_camera(rest: str, bench: Bench) -> SimulatedCamera:
+    """The camera of `sim:REST`.
+
+    seed=N      another person in another room
+    coarse      a coarse head in small pictures
+    fps=30      frames a second
+    drop=0.02   share of frames that are lost
+    unplug_s=5  it goes away so many seconds after its first frame
+    drift_s=5   its exposure changes by itself after so many seconds
+    edges=FILE  it is lit by a lamp that writes its edges there (see `edge_file`), in real time
+    unposed     it keeps its poses and the scene's points to itself
+
+    Raises:
+        CameraError: A setting is not understood.
+    """
+    options = parse_options(rest, _CAMERA_OPTIONS, CameraError, scheme="sim")
+    config = RigConfig.from_seed(options.get("seed", 0))
+    if "coarse" in options:
+        config = replace(RigConfig.small(), subject=config.subject, room_seed=config.room_seed)
+    config = replace(
+        config,
+        fps=options.get("fps", config.fps),
+        path=replace(config.path, duration_s=bench.walk_s),
+        sensor=replace(config.sensor, dropped=options.get("drop", config.sensor.dropped)),
+    )
+    if "edges" in options and isinstance(bench.clock, VirtualClock):
+        raise CameraError(f"sim:{rest}: edges=... goes with a flash in real time, not with a simulated one.")
+    return SimulatedCamera(
+        url=f"sim:{rest}",
+        config=config,
+        bench=bench,
+        edges=EdgeFile(Path(options["edges"])) if "edges" in options else None,
+        faults=CameraFaults(options.get("unplug_s"), options.get("drift_s")),
+        tells_scene="unposed" not in options,
+    )
 
 
-class SimulatedRig:
-    """Records from the simulated rig."""
+def open_flash(rest: str, bench: Bench) -> SimulatedFlash:
+    """The flash of `sim:REST`.
 
-    def __init__(self, config: RigConfig) -> None:
-        """Builds the scene, which takes some seconds."""
-        self._rig = Rig.build(config)
-        camera = self._rig.camera(0.0, "0000")
-        self.description = RigDescription(
-            width=camera.width,
-            height=camera.height,
-            transfer=config.sensor.transfer,
-            rotation_deg=config.rotation_deg,
-            device={
-                "name": "simulated rig",
-                "exposure_s": config.sensor.exposure_s,
-                "readout_s": config.sensor.readout_s,
-            },
-            flash_schedule={"period_s": config.lamp.period_s, "on_s": config.lamp.on_s},
-            duration_s=config.path.duration_s,
-            flash_offset_cam_m=config.flash_offset_cam_m,
-            cloud=self._cloud(),
-        )
+    missed=0.1   share of pulses that do not happen; 1 = a lamp that is dead
+    jitter_ms=1  of the starts
+    unplug_s=5   it goes away so many seconds after the train's start
+    reset_s=5    it restarts then
+    seed=N       of the chance in the above
 
-    def _cloud(self) -> PointCloud:
-        """What dense stereo along the path would find."""
-        config = self._rig.config
-        cameras = [
-            self._rig.camera(part * config.path.duration_s, "stereo") for part in np.linspace(0.03, 0.97, 9)
-        ]
-        rng = np.random.default_rng([config.subject.seed, 404])
-        return stereo_cloud(self._rig.bust, cameras, config.cloud_points, rng)
-
-    def frames(self) -> Iterator[CapturedFrame]:
-        """The frames, made as they are asked for."""
-        sequence = 0
-        for frame in self._rig.frames():
-            sequence += frame.truth.dropped_before
-            yield CapturedFrame(frame.pts_s, sequence, frame.rgb, frame.camera)
-            sequence += 1
+    Raises:
+        FlashError: A setting is not understood.
+    """
+    options = parse_options(rest, _FLASH_OPTIONS, FlashError, scheme="sim")
+    faults = FlashFaults(
+        missed=options.get("missed", 0.0),
+        jitter_s=1e-3 * options.get("jitter_ms", 0.2),
+        unplug_s=options.get("unplug_s"),
+        reset_s=options.get("reset_s"),
+        seed=options.get("seed", 0),
+    )
+    return SimulatedFlash(f"sim:{rest}", bench, faults)
 
 
-def _config(settings: str) -> RigConfig:
-    """The configuration of "seed=3", "coarse", or both with a semicolon between."""
-    config = RigConfig()
-    coarse = False
-    for setting in filter(None, settings.split(";")):
-        key, _, value = setting.partition("=")
-        if key == "seed" and value.isdecimal():
-            config = RigConfig.from_seed(int(value))
-        elif setting == "coarse":
-            coarse = True
-        else:
-            raise DeviceError(f"sim:{settings} is not understood; known are seed=NUMBER and coarse.")
-    if coarse:
-        return replace(RigConfig.small(), subject=config.subject, room_seed=config.room_seed)
-    return config
+def list_cameras() -> tuple[str, ...]:
+    """None: a simulated camera is asked for, never found."""
+    return ()
+
+
+def list_flashes() -> tuple[str, ...]:
+    """None, likewise."""
+    return ()

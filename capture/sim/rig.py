@@ -52,8 +52,15 @@ _SUNSET = studio_map(
 
 
 @dataclass(frozen=True)
-class _Exposure:
-    """A frame that is to be taken: its place in the file, the sensor's count, its start, losses before it."""
+class Exposure:
+    """A frame that is to be taken.
+
+    Attributes:
+        index: its place in the file.
+        tick: the sensor's count.
+        start_s: of its first row.
+        dropped_before: frames lost just before it.
+    """
 
     index: int
     tick: int
@@ -275,30 +282,59 @@ class Rig:
         """The recording's frames, in order, made as they are asked for; lost ones are not among them."""
         c, sensor = self.config, self.config.sensor
         rng = np.random.default_rng([sensor.seed, 5])
-        exposures: list[_Exposure] = []
+        exposures: list[Exposure] = []
         dropped = 0
         for tick in range(round(c.path.duration_s * c.fps)):
             start_s = max(0.0, tick / c.fps + sensor.timestamp_jitter_s * float(np.clip(rng.normal(), -4, 4)))
             if tick > 0 and rng.random() < sensor.dropped:
                 dropped += 1
                 continue
-            exposures.append(_Exposure(len(exposures), tick, start_s, dropped))
+            exposures.append(Exposure(len(exposures), tick, start_s, dropped))
             dropped = 0
         yield from computed_ahead(self._expose, exposures)
 
-    def _expose(self, exposure: _Exposure) -> RigFrame:
+    def _expose(self, exposure: Exposure) -> RigFrame:
+        return self.take(exposure, self.pulses)
+
+    def unlit(self, start_s: float) -> Layers:
+        """The layers without flash of a frame that starts at this time, to be made beforehand."""
+        middle_s = self._middle_s(start_s)
+        return self.layers(self.camera(middle_s, "unlit"), False, self.room_from_head(middle_s))
+
+    def _middle_s(self, start_s: float) -> float:
+        return start_s + 0.5 * (self.config.sensor.readout_s + self.config.sensor.exposure_s)
+
+    def take(
+        self,
+        exposure: Exposure,
+        pulses: PulseTrain,
+        *,
+        sensitivity: float = 1.0,
+        unlit: Layers | None = None,
+    ) -> RigFrame:
+        """One frame.
+
+        Args:
+            exposure: when.
+            pulses: the lamp's.
+            sensitivity: factor on the signal, of exposure and gain.
+            unlit: what `unlit` gave for its start, to save the time.
+        """
         c, sensor = self.config, self.config.sensor
         index, start_s = exposure.index, exposure.start_s
-        middle_s = start_s + 0.5 * (sensor.readout_s + sensor.exposure_s)
+        middle_s = self._middle_s(start_s)
         camera = self.camera(middle_s, f"{index:04d}")
-        lit = self.pulses.lit_fraction(start_s, camera.height, sensor.readout_s, sensor.exposure_s)
-        flash = self.pulses.flag(lit)
-        layers = self.layers(camera, bool(lit.max() > 0), self.room_from_head(middle_s))
+        lit = pulses.lit_fraction(start_s, camera.height, sensor.readout_s, sensor.exposure_s)
+        flash = pulses.flag(lit)
+        if unlit is not None and lit.max() == 0:
+            layers = unlit
+        else:
+            layers = self.layers(camera, bool(lit.max() > 0), self.room_from_head(middle_s))
         radiance = layers.room * sensor.row_flicker(start_s, camera.height)[:, None, None]
         if layers.flash is not None:
             radiance = radiance + lit[:, None, None] * layers.flash
         end_s = start_s + sensor.readout_s + sensor.exposure_s
-        near = [p for p in self.pulses.pulses if p.on_s < end_s and p.off_s + c.lamp.fall_s > start_s]
+        near = [p for p in pulses.pulses if p.on_s < end_s and p.off_s + c.lamp.fall_s > start_s]
         pulse = near[0] if near and lit.max() > 0 else None
         truth = FrameTruth(
             index=index,
@@ -312,5 +348,5 @@ class Rig:
             dropped_before=exposure.dropped_before,
             shaken=c.shake.blurs(exposure.tick),
         )
-        rgb = self.expose(radiance, camera, middle_s, exposure.tick)
+        rgb = self.expose(radiance * np.float32(sensitivity), camera, middle_s, exposure.tick)
         return RigFrame(start_s, rgb, camera, lit, truth)
