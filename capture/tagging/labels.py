@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from capture.tagging.bands import BandGains
 from capture.tagging.config import TaggingConfig
 from capture.tagging.edges import EdgeCurve, EdgeRange, Edges, calibrated, find_edges
+from capture.tagging.known import Commands
 from capture.tagging.schedule import fit_rhythm, neighbours_log_prior
 from capture.tagging.shutter import lit_share, share_after, sharp_limits
 from capture.tagging.shutter_fit import Shutter
@@ -53,7 +54,12 @@ class EdgeLabels:
 
 
 def label_frames(
-    data: BandGains, edges: EdgeRange, shutter: Shutter, gain_prior: Floats, config: TaggingConfig
+    data: BandGains,
+    edges: EdgeRange,
+    shutter: Shutter,
+    gain_prior: Floats,
+    config: TaggingConfig,
+    commands: Commands | None = None,
 ) -> EdgeLabels:
     """Label probabilities, averaged over the unknown common stretch of readout and exposure."""
     middle = find_edges(data, edges, shutter.readout_s, shutter.exposure_s, gain_prior, _STEP_S)
@@ -64,7 +70,7 @@ def label_frames(
     for sigmas, weight in points:
         readout_s, exposure_s = shutter.stretched(sigmas)
         found = find_edges(data, edges, readout_s, exposure_s, gain_prior, _STEP_S)
-        on_p, off_p = _posterior(found, config)
+        on_p, off_p = _posterior(found, config, commands)
         f, n, a = _probabilities(data.start_s, found, on_p, off_p, readout_s, exposure_s, config)
         full, none, lit = full + weight * f, none + weight * n, lit + weight * a
         if sigmas == 0.0:
@@ -76,8 +82,19 @@ def label_frames(
     return EdgeLabels(full, none, lit, excess, excess_sigma, on_s, off_s, on_sigma_s, off_sigma_s, gain)
 
 
-def _posterior(found: Edges, config: TaggingConfig) -> tuple[Floats, Floats]:
-    """Probabilities on both edges' grids, with what the other pulses' rhythm says."""
+def _posterior(found: Edges, config: TaggingConfig, commands: Commands | None) -> tuple[Floats, Floats]:
+    """Probabilities on both edges' grids, with what the other pulses' rhythm or lateness says."""
+    locked = None if commands is None else commands.partners(found.on.best_s)
+    if commands is not None and locked is not None:
+        partner, _ = locked
+        # Times are moved so that the commands are a period apart: what is left of a rhythm is lateness.
+        period_s = float(np.median(np.diff(commands.times_s)))
+        moved = np.where(partner >= 0, commands.times_s[partner] - partner * period_s, 0.0)[:, None]
+        on, off = (EdgeCurve(curve.time_s - moved, curve.log) for curve in (found.on, found.off))
+        return (
+            found.on.probability(neighbours_log_prior(on, partner, period_s)),
+            found.off.probability(neighbours_log_prior(off, partner, period_s)),
+        )
     rhythm = fit_rhythm(0.5 * (found.on.best_s + found.off.best_s), config)
     if rhythm is None:
         return found.on.probability(), found.off.probability()

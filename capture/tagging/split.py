@@ -59,7 +59,12 @@ class Split:
 
 
 def split_frames(
-    pts_s: Floats, blocks: NDArray[np.float32], config: TaggingConfig, *, most_lit: float = 0.4
+    pts_s: Floats,
+    blocks: NDArray[np.float32],
+    config: TaggingConfig,
+    *,
+    most_lit: float = 0.4,
+    known: Floats | None = None,
 ) -> Split:
     """Split a sequence into lit and unlit frames.
 
@@ -68,6 +73,7 @@ def split_frames(
         blocks: [K, n, n] mean linear light, positive.
         config: limits.
         most_lit: share of lit frames above which this is no flash.
+        known: [n, n] log gain of the flash, from before; None = looked for without.
 
     Raises:
         TaggingError: fewer than 8 frames, or no two classes.
@@ -78,19 +84,22 @@ def split_frames(
             f"{count} frames are too few to tell lit from unlit ones; at least 8 with both kinds are needed."
         )
     log = np.log(blocks.astype(np.float64)).reshape(count, -1)
-    gain = np.clip(_symmetric_gain(pts_s, log, config), -_LARGEST_LOG_GAIN, _LARGEST_LOG_GAIN)
+    gain = np.clip(symmetric_gain(pts_s, log, config), -_LARGEST_LOG_GAIN, _LARGEST_LOG_GAIN)
     noise = _spread(gain) + _LEAST_NOISE
     # Before the pattern is known: how many blocks rise together, each counted in its own noise and at most
     # twice.
     score = np.clip(gain / noise, -2, 2).mean(axis=1)
     core = _brief(pts_s, score > otsu_threshold(score), config)
+    if known is not None:
+        weight = known.ravel() / noise**2
+        core = _brief(pts_s, gain @ weight > 0.5 * float(known.ravel() @ weight), config)
     pattern = np.zeros(log.shape[1])
     for turn in range(_ROUNDS):
         if not core.any():
             break
         unlit = ~ndimage.binary_dilation(core, iterations=1)
         if turn >= _BLIND_ROUNDS:  # the classes are good enough to look only at unlit frames, and nearer ones
-            gain = np.clip(_local_gain(pts_s, log, unlit), -_LARGEST_LOG_GAIN, _LARGEST_LOG_GAIN)
+            gain = np.clip(local_gain(pts_s, log, unlit), -_LARGEST_LOG_GAIN, _LARGEST_LOG_GAIN)
             noise = _spread(gain[unlit]) + _LEAST_NOISE
         # Smoothing leaves the pattern few degrees of freedom, so that chance cannot carve one out of noise.
         rough = np.median(gain[core], axis=0) - np.median(gain[unlit], axis=0)
@@ -182,7 +191,7 @@ def _spread(values: Floats) -> Floats:
     return 1.4826 * np.median(np.abs(values - np.median(values, axis=0)), axis=0)
 
 
-def _symmetric_gain(pts_s: Floats, log: Floats, config: TaggingConfig) -> Floats:
+def symmetric_gain(pts_s: Floats, log: Floats, config: TaggingConfig) -> Floats:
     """[K, N] log gain over the median of symmetric pairs of neighbours: a steady trend cancels, classes
     unknown yet."""
     count = len(pts_s)
@@ -200,7 +209,7 @@ def _symmetric_gain(pts_s: Floats, log: Floats, config: TaggingConfig) -> Floats
     return log - np.median(pairs, axis=0)
 
 
-def _local_gain(pts_s: Floats, log: Floats, unlit: NDArray[np.bool_]) -> Floats:
+def local_gain(pts_s: Floats, log: Floats, unlit: NDArray[np.bool_]) -> Floats:
     """[K, N] log gain over a straight line in time through the nearest unlit frames on both sides.
 
     At an end, where a line would extrapolate, over the mean of the two nearest on the other side.

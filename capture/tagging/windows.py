@@ -48,10 +48,10 @@ class PulseWindow:
 
 def find_windows(pts_s: Floats, split: Split, config: TaggingConfig) -> list[PulseWindow]:
     """Candidate pulses, in order, with no frame in two of them."""
-    runs = [(first, last, False) for first, last in _runs(split.core)]
+    runs = [(first, last, False) for first, last in runs_of(split.core)]
     runs = _merged(pts_s, runs, config)
     weak = (split.score > max(_WEAK_SCORE, _WEAK_SPREADS * split.spread)) & ~split.core
-    for first, last in _runs(weak):
+    for first, last in runs_of(weak):
         if all(last < a - _GUARD or first > b + _GUARD for a, b, _ in runs):
             peak = first + int(np.argmax(split.score[first : last + 1]))
             runs.append((peak, peak, True))
@@ -100,7 +100,7 @@ def edge_range(
     return EdgeRange(np.array(on_low), np.array(on_high), np.array(off_low), np.array(off_high))
 
 
-def _runs(flags: NDArray[np.bool_]) -> list[tuple[int, int]]:
+def runs_of(flags: NDArray[np.bool_]) -> list[tuple[int, int]]:
     """First and last index of each run of True."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
     return [(int(a), int(b) - 1) for a, b in zip(edges[::2], edges[1::2], strict=True)]
