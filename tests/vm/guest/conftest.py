@@ -1,0 +1,51 @@
+"""Of the tests in the machine: each is reported through the share as it begins and as it ends."""
+
+import faulthandler
+import json
+import os
+import sys
+from pathlib import Path
+
+import pytest
+
+EVENTS = Path("/run/machine/share/events.jsonl")
+PART = os.environ["PART"]
+LIMIT_S = float(os.environ["TEST_LIMIT_S"])
+
+
+def _report(**event):
+    with EVENTS.open("a") as lines:
+        lines.write(json.dumps({"part": PART} | event) + "\n")
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item):
+    _report(event="start", test=item.name)
+    faulthandler.dump_traceback_later(LIMIT_S, exit=True, file=sys.__stderr__)
+    try:
+        return (yield)
+    finally:
+        faulthandler.cancel_dump_traceback_later()
+
+
+_failed = {}
+
+
+def pytest_runtest_logreport(report):
+    """One line a test, when its fixtures are taken down: the worst of its three phases."""
+    name = report.nodeid.rpartition("::")[2]
+    outcome, detail, seconds = _failed.pop(name, ("passed", "", 0.0))
+    seconds += report.duration
+    if report.failed:
+        outcome, detail = "failed", detail + report.longreprtext
+    elif report.skipped and outcome == "passed":
+        outcome, detail = "skipped", report.longrepr[2]
+    if report.when == "teardown":
+        _report(event="end", test=name, outcome=outcome, seconds=seconds, detail=detail)
+    else:
+        _failed[name] = (outcome, detail, seconds)
+
+
+def pytest_collectreport(report):
+    if report.failed:
+        _report(event="end", test=PART, outcome="failed", seconds=0.0, detail=report.longreprtext)
