@@ -92,6 +92,11 @@ class ClockFit:
         return (1 / (1 + float(self._line[1])) - 1) * 1e6
 
     @property
+    def drift_sigma_ppm(self) -> float:
+        """Standard deviation of `drift_ppm`."""
+        return math.sqrt(float(self._covariance[1, 1])) * 1e6
+
+    @property
     def residuals_s(self) -> NDArray[np.float64]:
         """[N] middles of the round trips in memory minus the fit, oldest first, seconds."""
         return self._residuals
@@ -163,7 +168,7 @@ class ClockFit:
             "outliers": self.outliers,
             "restarts": self.restarts,
             "drift_ppm": round(self.drift_ppm, 3) if known else None,
-            "drift_sigma_ppm": round(math.sqrt(float(self._covariance[1, 1])) * 1e6, 3) if known else None,
+            "drift_sigma_ppm": round(self.drift_sigma_ppm, 3) if known else None,
             "residual_rms_s": float(np.sqrt(np.mean(self._residuals**2))) if known else None,
             "residual_max_s": float(np.max(np.abs(self._residuals))) if known else None,
             "quickest_round_trip_s": 2 * self._quickest_s if known else None,
