@@ -1,0 +1,76 @@
+from collections import namedtuple
+from types import SimpleNamespace
+
+import pytest
+
+from capture.controller.config import CaptureConfig
+from capture.controller.stop_rules import StopRules
+from capture.devices.camera import ControlReport
+
+Usage = namedtuple("Usage", "free")
+
+
+@pytest.fixture
+def rules(tmp_path):
+    return StopRules(CaptureConfig(), tmp_path, fps=30.0)
+
+
+def test_good_light_stops_nothing(rules):
+    assert all(rules.of_light(0.2, 0.03) is None for _ in range(200))
+
+
+def test_a_second_of_white_frames_stops_but_flashes_do_not(rules):
+    lit_every = [rules.of_light(0.9, 0.9 if k % 30 < 3 else 0.1) for k in range(120)]
+    assert set(lit_every) == {None}
+    sentence = [rules.of_light(1.0, 0.8) for _ in range(40)][-1]
+    assert "80% of the picture is clipped" in sentence
+    assert "--exposure" in sentence
+
+
+def test_black_frames_stop_unless_a_flash_is_among_them(rules):
+    assert all(rules.of_light(0.3 if k % 30 == 0 else 0.0, 0.0) is None for k in range(120))
+    assert "lens cap" in [rules.of_light(1e-5, 0.0) for _ in range(70)][-1]
+
+
+def test_a_flash_that_is_never_seen_stops_after_four_and_one_that_was_does_not(rules):
+    assert rules.of_pulses(3, 0) is None
+    assert "4 flashes were due" in rules.of_pulses(4, 0)
+    assert rules.of_pulses(40, 1) is None
+
+
+def test_controls_that_drifted_stop_when_they_are_seen_twice(rules):
+    camera = SimpleNamespace(check=lambda: (ControlReport(name="gain", requested=1.0, read_back=4.0),))
+    assert rules.of_devices(camera, 0.0) is None
+    assert rules.of_devices(camera, 0.5) is None  # looked at once a second
+    assert "gain went from 1 to 4" in rules.of_devices(camera, 1.1)
+
+
+def test_a_stale_read_back_is_forgiven(rules):
+    drifted = (ControlReport(name="gain", requested=1.0, read_back=4.0),)
+    answers = iter([drifted, (), drifted, ()])
+    camera = SimpleNamespace(check=lambda: next(answers))
+    assert [rules.of_devices(camera, float(2 * k)) for k in range(4)] == [None] * 4
+
+
+def test_a_disk_that_fills_stops_before_it_is_full(rules, monkeypatch):
+    camera = SimpleNamespace(check=lambda: ())
+    monkeypatch.setattr("shutil.disk_usage", lambda path: Usage(free=10_000_000))
+    assert "10 MB left, less than the 315 MB" in rules.of_devices(camera, 0.0)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"period_s": 0.2},
+        {"on_s": 0.3},
+        {"on_s": 0.0},
+        {"period_s": 0.4, "on_s": 0.21},
+        {"duration_s": 2.0},
+        {"duration_s": float("inf")},
+        {"level": 0.0},
+        {"kept_rate_hz": float("nan")},
+    ],
+)
+def test_settings_beyond_safety_or_sense_are_refused(wrong):
+    with pytest.raises(ValueError, match=next(reversed(wrong))):
+        CaptureConfig(**wrong)
