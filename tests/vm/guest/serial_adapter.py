@@ -16,7 +16,7 @@ from usbip.classes.device.cdc_acm import CDCACM
 
 @contextmanager
 def program_on_a_wire(*command, output, name="Flash", serial="0001"):
-    """Starts the program and plugs it in; yields a function that pulls the plug, and leaves the program alive.
+    """Starts the program and plugs it in; yields a function that pulls the plug; the program lives on.
 
     Args:
         command: Program that prints "pty PATH ..." and lives until its input ends.
