@@ -1,0 +1,325 @@
+"""A camera of two halves: its controls by USB requests, its pictures through another back end.
+
+Order of a lock (each step is there because some camera needs it): what the automatics have found is read; the
+stream starts and some frames are dropped, because firmware forgets its controls at a start; automatics off,
+exposure by way of another mode, because a camera can have lost the mode that it says it has; only then the
+values, because they are refused while an automatic is on; last everything is read back.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Self
+
+from capture.devices.bench import Bench
+from capture.devices.camera import (
+    CameraDevice,
+    CameraInfo,
+    CameraProfile,
+    CapturedFrame,
+    ControlReport,
+    LockReport,
+    StreamFormat,
+)
+from capture.devices.uvc.requests import UvcControls
+from capture.devices.uvc.usb_link import StalledError, UsbLink
+from capture.errors import CameraError, CameraGoneError
+
+_MANUAL, _AUTO, _SHUTTER_PRIORITY, _APERTURE_PRIORITY = 1, 2, 4, 8
+_AUTOMATICS = (
+    "auto_exposure_priority",
+    "white_balance_temperature_auto",
+    "white_balance_component_auto",
+    "focus_auto",
+    "hue_auto",
+    "contrast_auto",
+)
+#: Control -> the automatic that sets it, and the values of that in which it does.
+_GOVERNED = {
+    "exposure_time_absolute": ("auto_exposure_mode", (_AUTO, _APERTURE_PRIORITY)),
+    "iris_absolute": ("auto_exposure_mode", (_AUTO, _SHUTTER_PRIORITY)),
+    "white_balance_temperature": ("white_balance_temperature_auto", (1,)),
+    "white_balance_blue": ("white_balance_component_auto", (1,)),
+    "white_balance_red": ("white_balance_component_auto", (1,)),
+    "focus_absolute": ("focus_auto", (1,)),
+    "hue": ("hue_auto", (1,)),
+    "contrast": ("contrast_auto", (1,)),
+}
+_NEUTRALISED = ("backlight_compensation", "sharpness")  # set to their least value
+_RECORDED = (
+    "brightness",
+    "contrast",
+    "saturation",
+    "hue",
+    "gamma",
+    "white_balance_blue",
+    "white_balance_red",
+    "digital_multiplier",
+    "iris_absolute",
+    "zoom_absolute",
+    "pan_absolute",
+    "tilt_absolute",
+    "roll_absolute",
+)
+_HZ_OF_POWER_LINE: dict[int, float] = {0: 0.0, 1: 50.0, 2: 60.0}
+_POWER_LINE_OF_HZ: dict[float, float] = {0: 0.0, 50: 1.0, 60: 2.0}
+_SETTLING_S = 0.5  # a lens that moves (GET_INFO: asynchronous) answers with where it is
+_SETTLING_STEP_S = 0.05
+
+
+@dataclass(frozen=True)
+class _Setting:
+    """A field of the profile and the control that it goes to, with the conversion both ways."""
+
+    field: str
+    control: str
+    to_device: Callable[[float], float] = float
+    from_device: Callable[[int], float | None] = float
+
+
+_SETTINGS = (
+    _Setting("exposure_s", "exposure_time_absolute", lambda s: s * 1e4, lambda units: units / 1e4),
+    _Setting("gain", "gain"),
+    _Setting("white_balance_k", "white_balance_temperature"),
+    _Setting("focus", "focus_absolute"),
+    _Setting("mains_hz", "power_line_frequency", _POWER_LINE_OF_HZ.__getitem__, _HZ_OF_POWER_LINE.get),
+)
+
+
+class UvcCamera:
+    """Controls over USB beside a stream of another back end; `open_camera` puts them together."""
+
+    def __init__(
+        self, info: CameraInfo, link: UsbLink, controls: UvcControls, stream: CameraDevice, bench: Bench
+    ) -> None:
+        """Takes over the link and the stream, and closes them."""
+        self.info = info
+        self._link = link
+        self._controls = controls
+        self._stream = stream
+        self._bench = bench
+        self._found: dict[str, int] | None = None
+        self._locked: dict[str, int] = {}
+
+    @property
+    def format(self) -> StreamFormat:
+        """Of the stream."""
+        return self._stream.format
+
+    def lock(self, profile: CameraProfile) -> LockReport:
+        """See the module for the order.
+
+        Raises:
+            CameraError: The stream does not start, or the camera does not answer.
+        """
+        first = self._found is None
+        before = self._readable()
+        if self._found is None:
+            self._found = before
+        streamed = self._stream.lock(
+            CameraProfile(
+                width=profile.width,
+                height=profile.height,
+                fps=profile.fps,
+                pixel_format=profile.pixel_format,
+                settle_frames=profile.settle_frames if first else 0,
+            )
+        )
+        reports = [*self._automatics_off(first)]
+        for setting in _SETTINGS:
+            reports.extend(self._apply(setting, getattr(profile, setting.field), before, first))
+        for name in _NEUTRALISED:
+            if name in self._controls:
+                least = self._controls.limits(name).minimum or 0
+                reports.append(self._set(name, name, float(least), float, first, requested=float(least)))
+        for name in _RECORDED:
+            if name in self._controls:
+                value = self._controls.get(name)
+                self._locked[name] = value
+                reports.append(ControlReport(name=name, requested=None, read_back=float(value)))
+        fps = [report for report in streamed.controls if report.name == "fps"]
+        warnings = [*streamed.warnings, *self._warnings(reports)]
+        return LockReport(controls=(*fps, *reports), warnings=tuple(warnings))
+
+    def _readable(self) -> dict[str, int]:
+        values = {}
+        for name in self._controls.names:
+            try:
+                values[name] = self._controls.get(name)
+            except StalledError:
+                continue  # one that can only be set, or not be read while an automatic has it
+        return values
+
+    def _automatics_off(self, first: bool) -> list[ControlReport]:
+        reports = []
+        if "auto_exposure_mode" in self._controls:
+            modes = self._controls.modes("auto_exposure_mode")
+            wanted = _SHUTTER_PRIORITY if modes & _SHUTTER_PRIORITY and not modes & _MANUAL else _MANUAL
+            detour = next((mode for mode in (_APERTURE_PRIORITY, _AUTO) if modes & mode), None)
+            if first and detour is not None and self._controls.get("auto_exposure_mode") == wanted:
+                self._try_set("auto_exposure_mode", detour)
+            name = "auto_exposure_mode"
+            reports.append(self._set(name, name, wanted, float, first, requested=float(wanted)))
+        for name in _AUTOMATICS:
+            if name in self._controls:
+                reports.append(self._set(name, name, 0.0, float, first, requested=0.0))
+        return reports
+
+    def _apply(
+        self, setting: _Setting, asked: float | None, before: dict[str, int], first: bool
+    ) -> list[ControlReport]:
+        """Sets one field of the profile; without a wish, what the automatic had found stays."""
+        name = setting.control
+        if name not in self._controls:
+            if asked is None:
+                return []
+            note = "the camera has no such control"
+            return [ControlReport(name=setting.field, requested=asked, read_back=None, note=note)]
+        if asked is not None:
+            value = setting.to_device(asked)
+        elif name == "power_line_frequency" and before.get(name) not in _HZ_OF_POWER_LINE:
+            value = 0.0  # it looks for the mains by itself, an automatic too
+        elif name in before:
+            value = float(before[name])
+        else:
+            value = float(self._controls.limits(name).default or 0)
+        return [self._set(setting.field, name, value, setting.from_device, first, requested=asked)]
+
+    def _set(
+        self,
+        report_name: str,
+        name: str,
+        value: float,
+        from_device: Callable[[int], float | None],
+        always: bool,
+        requested: float | None,
+    ) -> ControlReport:
+        """Sets a control to the nearest value that the camera takes, reads it back, says how that went."""
+        limits = self._controls.limits(name)
+        chosen = limits.nearest(value)
+        notes = []
+        if requested is not None and abs(chosen - value) > 0.5:
+            notes.append(f"asked for {value:.6g} in the camera's units, which takes {limits}")
+        try:
+            if always or self._controls.get(name) != chosen:
+                if self._controls.state(name).disabled_by_auto:
+                    notes.append("the camera says that an automatic has it")
+                self._controls.set(name, chosen)
+            read = self._read_back(name, chosen)
+        except StalledError as error:
+            notes.append(str(error).rstrip("."))
+            return ControlReport(name=report_name, requested=requested, read_back=None, note="; ".join(notes))
+        if read != chosen:
+            notes.append(f"set to {chosen}, but the camera says {read}")
+        self._locked[name] = read
+        return ControlReport(
+            name=report_name, requested=requested, read_back=from_device(read), note="; ".join(notes)
+        )
+
+    def _read_back(self, name: str, chosen: int) -> int:
+        read = self._controls.get(name)
+        waited_s = 0.0
+        while read != chosen and waited_s < _SETTLING_S and self._controls.state(name).asynchronous:
+            self._bench.clock.sleep(_SETTLING_STEP_S)
+            waited_s += _SETTLING_STEP_S
+            read = self._controls.get(name)
+        return read
+
+    def _try_set(self, name: str, value: int) -> None:
+        with suppress(StalledError):
+            self._controls.set(name, value)
+
+    def _warnings(self, reports: list[ControlReport]) -> list[str]:
+        warnings = [f"{report.name}: {report.note}." for report in reports if report.note]
+        if "exposure_time_absolute" not in self._controls:
+            warnings.append(
+                f"The {self._link.device} announces no exposure time over USB; light the room evenly and "
+                "check that its pictures do not change by themselves, or use another camera."
+            )
+        exposure_s = self._locked.get("exposure_time_absolute", 0) / 1e4
+        fps = self._stream.format.fps
+        if fps and exposure_s * fps > 1:
+            warnings.append(
+                f"An exposure of {exposure_s:g} s is longer than the {1 / fps:.4g} s from frame to frame at "
+                f"{fps:g} fps; the camera will cut it or slow down."
+            )
+        return warnings
+
+    def read(self, timeout_s: float) -> CapturedFrame:
+        """The next frame of the stream."""
+        return self._stream.read(timeout_s)
+
+    def check(self) -> tuple[ControlReport, ...]:
+        """Reads every locked control again: other programs and the firmware change them."""
+        changed = []
+        names = {setting.control: setting for setting in _SETTINGS}
+        for name, locked in self._locked.items():
+            setting = names.get(name, _Setting(name, name))
+            try:
+                read = self._controls.get(name)
+            except StalledError as error:
+                changed.append(
+                    ControlReport(
+                        name=setting.field,
+                        requested=setting.from_device(locked),
+                        read_back=None,
+                        note=str(error).rstrip("."),
+                    )
+                )
+                continue
+            if read != locked:
+                changed.append(
+                    ControlReport(
+                        name=setting.field,
+                        requested=setting.from_device(locked),
+                        read_back=setting.from_device(read),
+                        verified=False,
+                        note=f"was {locked} after the lock and is {read} now",
+                    )
+                )
+        return (*changed, *self._stream.check())
+
+    def restore(self) -> tuple[str, ...]:
+        """Puts back what `lock` found: the values first, because they are refused once an automatic is on."""
+        found, self._found = self._found, None
+        self._locked = {}
+        problems = list(self._stream.restore())
+        if found is None:
+            return tuple(problems)
+        automatics = ("auto_exposure_mode", *_AUTOMATICS)
+        values = [name for name in found if name not in automatics and not _was_governed(name, found)]
+        for name in (*values, *(name for name in automatics if name in found)):
+            try:
+                if self._controls.get(name) != found[name]:
+                    self._controls.set(name, found[name])
+            except CameraGoneError as error:
+                return (*problems, f"The controls could not be put back: {error}")
+            except CameraError as error:
+                problems.append(f"{name} could not be put back to {found[name]}: {error}")
+        return tuple(problems)
+
+    def close(self) -> None:
+        """Stops the stream and lets go of both halves."""
+        try:
+            self._stream.close()
+        finally:
+            self._link.close()
+
+    def __enter__(self) -> Self:
+        """Itself."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Closes it."""
+        self.close()
+
+
+def _was_governed(name: str, found: dict[str, int]) -> bool:
+    """Whether an automatic was setting a control when it was found, so that its value means nothing."""
+    automatic, values = _GOVERNED.get(name, ("", ()))
+    return found.get(automatic) in values
