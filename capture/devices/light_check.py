@@ -68,7 +68,7 @@ def linear_luma(frame: CapturedFrame, format: StreamFormat) -> NDArray[np.float3
 
 
 def mean_light(
-    read: Callable[[], CapturedFrame], format: Callable[[], StreamFormat], frames: int
+    read: Callable[[], CapturedFrame], format: Callable[[], StreamFormat], frames: int = MEASURED_FRAMES
 ) -> NDArray[np.float64]:
     """Mean linear light [h, w] of the next sound frames.
 
@@ -91,8 +91,8 @@ def mean_light(
             break
     if total is None or count < frames:
         raise CameraError(
-            f"Of {3 * frames + 10} frames only {count} were whole; use a shorter cable, a port of its own for "
-            "the camera, or a smaller picture."
+            f"Of {3 * frames + 10} frames only {count} were whole; use a shorter cable, a port of its own "
+            "for the camera, or a smaller picture."
         )
     return np.asarray(total / count)
 

@@ -127,8 +127,8 @@ def _of_size(usable: list[Mode], profile: CameraProfile, width: int, height: int
         exact = [mode for mode in usable if (mode.width, mode.height) == (nearest.width, nearest.height)]
         sizes = ", ".join(dict.fromkeys(f"{mode.width}x{mode.height}" for mode in usable))
         warnings = (
-            f"The camera has no pictures of {width} x {height}; {nearest.width} x {nearest.height} is nearest "
-            f"(it has {sizes}).",
+            f"The camera has no pictures of {width} x {height}; {nearest.width} x {nearest.height} is the "
+            f"nearest (it has {sizes}).",
         )
     wished = profile.fps or _LEAST_FPS
     fast = [mode for mode in exact if _fast(mode, wished)]
@@ -146,10 +146,10 @@ def _choice(mode: Mode, profile: CameraProfile, warnings: tuple[str, ...] = ()) 
     fps = min(reached) if reached else max(mode.rates)
     if profile.fps is not None and fps < profile.fps * _SAME_RATE:
         warnings += (
-            f"The camera gives {mode.width} x {mode.height} {mode.pixel_format} at {fps:g} frames a second at "
-            f"most, not {profile.fps:g}; a smaller picture or MJPG may be faster.",
+            f"The camera gives {mode.width} x {mode.height} {mode.pixel_format} at {fps:g} frames a "
+            f"second at most, not {profile.fps:g}; a smaller picture or MJPG may be faster.",
         )
-    return Choice(mode, fps if profile.fps is None or reached == [] else max(fps, profile.fps), warnings)
+    return Choice(mode, profile.fps or fps, warnings)
 
 
 def _fast(mode: Mode, fps: float) -> bool:

@@ -227,9 +227,7 @@ def translated(error: OSError, path: str, doing: str) -> CameraError:
             f"{path} does not exist; plug the camera in, or see what `ls /dev/video*` says."
         )
     if error.errno in _GONE:
-        return CameraGoneError(
-            f"{path} is not there any more; plug the camera in again, then go on with --resume."
-        )
+        return CameraGoneError(f"{path} is not there any more; plug the camera in again and use --resume.")
     if error.errno == errno.EBUSY:
         return CameraError(
             f"{path} cannot {doing}: it is in use; close the program that has it (`fuser {path}` names it)."
@@ -241,8 +239,8 @@ def translated(error: OSError, path: str, doing: str) -> CameraError:
         )
     if error.errno == errno.ENOSPC:
         return CameraError(
-            f"{path} cannot {doing}: the USB bus has no bandwidth left; use a smaller picture, a lower rate or "
-            "MJPG, or put the camera on a port of its own."
+            f"{path} cannot {doing}: no bandwidth is left on its USB bus; use a smaller picture, a lower "
+            "rate or MJPG, or put the camera on a port of its own."
         )
     name = errno.errorcode.get(error.errno or 0, str(error.errno))
     if error.errno in _LINK:
