@@ -130,16 +130,7 @@ def _split(
     profiles: FrameProfiles, config: TaggingConfig, known: KnownFlash | None
 ) -> tuple[Split, Flicker | None, NDArray[np.float32]]:
     """Lit and unlit frames, with the room's flicker taken out of the unlit part where there is any."""
-    blocks = profiles.blocks(BANDS, BLOCKS)
-    rows = np.log(blocks).mean(axis=2).astype(float)
-    level = rows.mean(axis=1)
-    # before any class is known: frames that stand out of their neighbourhood are left out
-    stands_out = level - np.array([np.median(level[max(k - 15, 0) : k + 16]) for k in range(len(level))])
-    usual = 1.4826 * np.median(np.abs(stands_out)) + 1e-6
-    flicker = find_flicker(profiles.pts_s, rows, np.abs(stands_out) < 4 * usual, BANDS, config)
-    if flicker is not None:
-        blocks = np.asarray(blocks / flicker.row_gain[:, :, None], np.float32)
-    square = blocks.reshape(len(profiles), BLOCKS, BANDS // BLOCKS, BLOCKS).mean(axis=2)
+    square, flicker, rows = steady_squares(profiles, config)
     split = split_frames(profiles.pts_s, square, config, known=None if known is None else known.pattern)
     if known is not None and split.log_gain < _LEAST_KNOWN_GAIN * known.log_gain:
         raise TaggingError(
@@ -150,6 +141,23 @@ def _split(
         unlit = ~ndimage.binary_dilation(split.score > 0.25, iterations=2)
         flicker = find_flicker(profiles.pts_s, rows, unlit, THUMBNAIL_ROWS, config) or flicker
     return split, flicker, square
+
+
+def steady_squares(
+    profiles: FrameProfiles, config: TaggingConfig
+) -> tuple[NDArray[np.float32], Flicker | None, Floats]:
+    """[K, n, n] mean light of blocks without the room's flicker, the flicker, [K, B] log rows."""
+    blocks = profiles.blocks(BANDS, BLOCKS)
+    rows = np.log(blocks).mean(axis=2).astype(float)
+    level = rows.mean(axis=1)
+    # before any class is known: frames that stand out of their neighbourhood are left out
+    stands_out = level - np.array([np.median(level[max(k - 15, 0) : k + 16]) for k in range(len(level))])
+    usual = 1.4826 * np.median(np.abs(stands_out)) + 1e-6
+    flicker = find_flicker(profiles.pts_s, rows, np.abs(stands_out) < 4 * usual, BANDS, config)
+    if flicker is not None:
+        blocks = np.asarray(blocks / flicker.row_gain[:, :, None], np.float32)
+    square = blocks.reshape(len(profiles), BLOCKS, BANDS // BLOCKS, BLOCKS).mean(axis=2)
+    return square, flicker, rows
 
 
 def _find_pulses(

@@ -48,9 +48,7 @@ def label_dark(
         return [UNTAGGED] * count
     log = np.log(squares.astype(np.float64)).reshape(count, -1)
     gain = np.clip(symmetric_gain(pts_s, log, config), -_LARGEST_LOG_GAIN, _LARGEST_LOG_GAIN)
-    score, weight = _score(gain, gain, pattern)
-    if _steps(log @ weight):
-        return [UNTAGGED] * count
+    score, _ = _score(gain, gain, pattern)
     unlit = ~ndimage.binary_dilation(score > 0.25, iterations=_GUARD)
     if unlit.sum() < 0.5 * count:
         return [UNTAGGED] * count
@@ -70,16 +68,24 @@ def label_dark(
     ]
 
 
+def light_stays(squares: NDArray[np.float32], pattern: Floats) -> bool:
+    """Whether the light jumps by a flash's worth and stays there: a lamp that is stuck, a room light.
+
+    Args:
+        squares: [K, n, n] mean linear light of blocks, positive.
+        pattern: [n, n] log gain of the flash.
+    """
+    if len(squares) < 3 * _STEP_FRAMES:
+        return False
+    log = np.log(squares.astype(np.float64)).reshape(len(squares), -1)
+    weight = pattern.ravel() / np.square(pattern).sum()
+    middle = ndimage.median_filter(log @ weight, _STEP_FRAMES, mode="nearest")
+    return bool(np.any(np.abs(middle[_STEP_FRAMES:] - middle[:-_STEP_FRAMES]) > _STEP))
+
+
 def _score(gain: Floats, unlit: Floats, pattern: Floats) -> tuple[Floats, Floats]:
     """[K] light in flashes by the matched filter, and the filter [N]."""
     noise = 1.4826 * np.median(np.abs(unlit - np.median(unlit, axis=0)), axis=0) + _LEAST_NOISE
     weight = pattern.ravel() / noise**2
     weight = weight / float(pattern.ravel() @ weight)
     return gain @ weight, weight
-
-
-def _steps(course: Floats) -> bool:
-    """Whether the light jumps to another level and stays there."""
-    middle = ndimage.median_filter(course, _STEP_FRAMES, mode="nearest")
-    change = middle[_STEP_FRAMES:] - middle[:-_STEP_FRAMES]
-    return bool(np.any(np.abs(change) > _STEP))

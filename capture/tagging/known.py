@@ -55,6 +55,11 @@ class KnownFlash:
         self._fits.append(fit)
 
     @property
+    def empty(self) -> bool:
+        """Whether no shutter has been fitted yet."""
+        return not self._fits
+
+    @property
     def shutter_settled(self) -> bool:
         """Whether further fits would not make the shutter known better."""
         if len(self._fits) < _ENOUGH:
@@ -111,7 +116,8 @@ class Commands:
         Args:
             on_s: [P] starts of pulses, increasing.
         """
-        if len(self.times_s) < _LEAST_LOCKED or len(on_s) < _LEAST_LOCKED:
+        least = _LEAST_LOCKED if self.offset_s is None else 1
+        if len(self.times_s) < least or len(on_s) < least:
             return None
         found: tuple[int, float, NDArray[np.int_], float] | None = None
         for start_s in self._offsets(on_s):
@@ -127,7 +133,7 @@ class Commands:
             rank = (matched, -abs(offset_s))
             if found is None or rank > found[:2]:
                 found = (*rank, np.where(near, partner, -1), offset_s)
-        if found is None or found[0] < max(_LEAST_LOCKED, _LEAST_MATCHED * len(on_s)):
+        if found is None or found[0] < max(least, _LEAST_MATCHED * len(on_s)):
             return None
         return _once(found[2], on_s - self.times_s[found[2]]), found[3]
 
@@ -151,6 +157,8 @@ def _once(partner: NDArray[np.int_], late: Floats) -> NDArray[np.int_]:
 
 def _nearest(times: Floats, t: Floats) -> NDArray[np.int_]:
     """Index of the time nearest to each t."""
+    if len(times) == 1:
+        return np.zeros(len(t), int)
     right = np.clip(np.searchsorted(times, t), 1, len(times) - 1)
     return right - (t - times[right - 1] < times[right] - t)
 

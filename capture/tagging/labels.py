@@ -88,7 +88,8 @@ def _posterior(found: Edges, config: TaggingConfig, commands: Commands | None) -
     if commands is not None and locked is not None:
         partner, _ = locked
         # Times are moved so that the commands are a period apart: what is left of a rhythm is lateness.
-        period_s = float(np.median(np.diff(commands.times_s)))
+        apart = np.diff(commands.times_s)
+        period_s = float(np.median(apart)) if len(apart) else config.longest_period_s
         moved = np.where(partner >= 0, commands.times_s[partner] - partner * period_s, 0.0)[:, None]
         on, off = (EdgeCurve(curve.time_s - moved, curve.log) for curve in (found.on, found.off))
         return (

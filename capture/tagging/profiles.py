@@ -128,6 +128,7 @@ class ProfileAccumulator:
         self._levels = levels
         self._matrix = matrix
         self._clip_display = (config or TaggingConfig()).clip_display
+        self._dropped = 0
         self._pts: list[float] = []
         self._codes: list[NDArray[np.uint8]] = []
         self._color: list[NDArray[np.float32]] = []
@@ -151,15 +152,16 @@ class ProfileAccumulator:
         Raises:
             TaggingError: wrong size, or a time that is not later than the one before.
         """
+        number = self._dropped + len(self._pts)
         if frame.shape[:2] != (self.height, self.width) or frame.ndim not in (2, 3):
             raise TaggingError(
-                f"Frame {len(self._pts)} is {'x'.join(map(str, frame.shape[1::-1]))}, but the sequence is "
+                f"Frame {number} is {'x'.join(map(str, frame.shape[1::-1]))}, but the sequence is "
                 f"{self.width}x{self.height}; all frames must have one size."
             )
         if not np.isfinite(pts_s) or (self._pts and pts_s <= self._pts[-1]):
             before = f"{self._pts[-1]:.6f} s" if self._pts else "the start"
             raise TaggingError(
-                f"Frame {len(self._pts)} is at {pts_s} s, not later than {before}; sort the frames by time."
+                f"Frame {number} is at {pts_s} s, not later than {before}; sort the frames by time."
             )
         small = self._display(_shrink(frame, THUMBNAIL_COLUMNS, THUMBNAIL_ROWS))
         readable = bool(np.all(np.isfinite(small))) and float(small.max()) > 0
@@ -173,18 +175,37 @@ class ProfileAccumulator:
         self._codes.append(np.round(255 * np.clip(self._code(luma), 0, 1)).astype(np.uint8))
         self._readable.append(readable)
 
-    def profiles(self) -> FrameProfiles:
-        """Everything seen so far."""
+    @property
+    def times_s(self) -> list[float]:
+        """Presentation times of the frames that are kept."""
+        return self._pts
+
+    def drop(self, count: int) -> None:
+        """Forgets the first frames that are still kept."""
+        self._dropped += count
+        for kept in (self._pts, self._codes, self._color, self._readable):
+            del kept[:count]
+
+    def square(self, side: int) -> NDArray[np.float32]:
+        """[side, side] mean linear light of blocks of the latest frame, black floor added."""
+        linear = self._linear_of_code()[self._codes[-1]] + np.float32(BLACK_FLOOR)
+        return _resized(linear, side, side)
+
+    def _linear_of_code(self) -> NDArray[np.float32]:
         codes = np.arange(256, dtype=np.float32) / 255
-        display = codes**2 if self._transfer == "linear" else codes
+        return to_linear(codes**2 if self._transfer == "linear" else codes, self._transfer)
+
+    def profiles(self, begin: int = 0, end: int | None = None) -> FrameProfiles:
+        """Everything that is kept, or a part of it."""
+        pts, codes, color = self._pts[begin:end], self._codes[begin:end], self._color[begin:end]
         empty = np.zeros((0, THUMBNAIL_ROWS, THUMBNAIL_COLUMNS), np.uint8)
         return FrameProfiles(
-            pts_s=np.array(self._pts),
-            codes=np.stack(self._codes) if self._codes else empty,
-            linear_of_code=to_linear(display, self._transfer),
+            pts_s=np.array(pts),
+            codes=np.stack(codes) if codes else empty,
+            linear_of_code=self._linear_of_code(),
             clip_code=int(np.ceil(255 * float(self._code(np.float32(self._clip_display))))),
-            color=np.stack(self._color) if self._color and len(self._color) == len(self._pts) else None,
-            readable=np.array(self._readable, bool),
+            color=np.stack(color) if color and len(self._color) == len(self._pts) else None,
+            readable=np.array(self._readable[begin:end], bool),
         )
 
     def _code(self, display: NDArray[np.float32] | np.float32) -> NDArray[np.float32] | np.float32:

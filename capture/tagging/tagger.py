@@ -5,6 +5,7 @@ Said of single frames and of the sequence: clipping, drift, gaps, a schedule tha
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -16,6 +17,7 @@ from capture.tagging.config import TaggingConfig
 from capture.tagging.prior import check_prior
 from capture.tagging.profiles import FrameProfiles
 from capture.tagging.result import FlashPrior, FrameTag, PriorCheck, Pulse, TagResult
+from capture.tagging.shutter_fit import Shutter
 
 # Frames farther apart than this many usual intervals have others missing between them.
 _GAP = 1.5
@@ -24,7 +26,10 @@ _KNOWN_SHARE = 0.25
 
 
 def tag(
-    profiles: FrameProfiles, *, schedule: FlashPrior | None = None, config: TaggingConfig | None = None
+    profiles: FrameProfiles,
+    *,
+    schedule: FlashPrior | None = None,
+    config: TaggingConfig | None = None,
 ) -> TagResult:
     """Tag every frame of a sequence.
 
@@ -49,13 +54,12 @@ def tag(
         )
     readable = profiles.take(seen)
     analysis = analyse(readable, config)
-    check, warnings = None, _warnings(analysis)
+    check: PriorCheck | None = None
+    more: list[str] = []
     if schedule is not None:
         on_s, off_s = analysis.found.labels.on_s, analysis.found.labels.off_s
         check, more = check_prior(schedule, on_s, off_s, float(readable.pts_s[0]), float(readable.pts_s[-1]))
-        warnings += more
-    tags = with_remarks(profiles, seen, analysis.frames, analysis.drift.affected, config)
-    return _result(tags, seen, analysis, check, warnings, readable.interval_s)
+    return result_of(profiles, seen, analysis, config, check, more)
 
 
 def with_remarks(
@@ -139,17 +143,28 @@ def _missed_times(found: Found) -> list[float]:
     return [float(t) for t in times]
 
 
-def _result(
-    tags: list[FrameTag],
+def result_of(
+    profiles: FrameProfiles,
     seen: NDArray[np.int_],
     analysis: Analysis,
-    check: PriorCheck | None,
-    warnings: list[str],
-    interval_s: float,
+    config: TaggingConfig,
+    check: PriorCheck | None = None,
+    more: Sequence[str] = (),
 ) -> TagResult:
+    """Everything about a sequence of which the readable frames have been analysed.
+
+    Args:
+        profiles: of all frames.
+        seen: [K] the readable ones.
+        analysis: of those.
+        config: limits of clipping.
+        check: of a schedule.
+        more: warnings that come with it.
+    """
+    tags = with_remarks(profiles, seen, analysis.frames, analysis.drift.affected, config)
     found, flicker = analysis.found, analysis.flicker
     shutter, rhythm = found.shutter, found.rhythm
-    known = shutter.readout_sigma_s < _KNOWN_SHARE * interval_s
+    known = shutter_is_known(shutter, profiles.take(seen).interval_s)
     return TagResult(
         frames=tuple(tags),
         pulses=tuple(pulses_of(found, seen)),
@@ -165,8 +180,13 @@ def _result(
         flicker_hz=flicker.frequency_hz if flicker is not None else None,
         flicker_depth=flicker.depth if flicker is not None else None,
         prior=check,
-        warnings=tuple(warnings),
+        warnings=(*_warnings(analysis), *more),
     )
+
+
+def shutter_is_known(shutter: Shutter, interval_s: float) -> bool:
+    """Whether the readout is known well enough to be told."""
+    return shutter.readout_sigma_s < _KNOWN_SHARE * interval_s
 
 
 def pulses_of(found: Found, seen: NDArray[np.int_]) -> list[Pulse]:
