@@ -100,11 +100,12 @@ class Scene:
         """Reads, linearises and undistorts a frame and its mask."""
         record = self._records[view.index]
         radiance = self._session.load_radiance(record)
-        limit = np.inf if str(record.file).endswith(_FLOAT_SUFFIXES) else CLIPPED_RADIANCE
+        keeps_highlights = str(record.file).endswith(_FLOAT_SUFFIXES)
+        limit = self._float_limit() if keeps_highlights else CLIPPED_RADIANCE
         # By channel: a maximum over the last axis takes several times as long. NaN fails every comparison.
         good = [np.abs(radiance[..., channel]) < limit for channel in range(3)]
         valid = (good[0] & good[1] & good[2]).astype(np.float32)
-        if limit == np.inf:
+        if keeps_highlights:
             radiance = np.where(np.isfinite(radiance), radiance, np.float32(0.0))
         coverage = self._session.load_mask(record)
         mask = None if coverage is None else coverage.astype(np.float32) / np.float32(255.0)
@@ -117,6 +118,10 @@ class Scene:
             torch.from_numpy(valid).to(self.device),
             None if mask is None else torch.from_numpy(mask).to(self.device),
         )
+
+    def _float_limit(self) -> float:
+        """Where float pixels are clipped: as the session says (RAW pictures), else nowhere."""
+        return float(self._session.info["image"].get("clip_radiance", np.inf))
 
 
 def load_scene(

@@ -12,6 +12,7 @@ from capture.importers.image_folder import find_pictures, import_image_folder
 from capture.importers.nerfstudio import import_nerfstudio
 from capture.importers.options import ImportOptions, Progress, no_progress
 from capture.importers.posed import import_posed
+from capture.importers.raw_files import find_raw_files
 from capture.json_fields import read_json
 from capture.session import Session
 
@@ -25,7 +26,7 @@ def import_source(
 
     Args:
         source: one folder or file (a posed image set, a COLMAP model or project, a nerfstudio set), a folder
-            of plain pictures, or the videos of one capture.
+            of RAW files or plain pictures, or the videos of one capture.
         out: session folder to make; one that an interrupted import of the same source left is completed.
         options: what the source does not say.
         progress: is told what is done and how much of it.
@@ -66,17 +67,17 @@ def _import(source: Sequence[Path], out: Path, options: ImportOptions, progress:
         return import_colmap(model, out, options, progress)
     if path.is_dir() and (videos := sorted(filter(_is_video, path.iterdir()))):
         return _import_videos(videos, out, options, progress)
-    if path.is_dir() and find_pictures(path):
+    if path.is_dir() and ((raws := find_raw_files(path)) or find_pictures(path)):
         if options.poses is not None:
             raise SourceError(
                 f"--poses is for videos; put {options.poses.name} beside the pictures of {path} as "
                 "cameras.json and import the folder."
             )
-        return import_image_folder(path, out, options, progress)
+        return (_import_raw if raws else import_image_folder)(path, out, options, progress)
     raise SourceError(
         f"{path} is no source that can be imported: a folder needs cameras.json, transforms.json, a COLMAP "
-        "model (or sparse/0 and images/), videos or pictures; a file must be a .json of these or a video "
-        f"({', '.join(sorted(VIDEO_SUFFIXES))})."
+        "model (or sparse/0 and images/), videos, RAW files or pictures; a file must be a .json of these or "
+        f"a video ({', '.join(sorted(VIDEO_SUFFIXES))})."
     )
 
 
@@ -88,6 +89,12 @@ def _import_videos(videos: Sequence[Path], out: Path, options: ImportOptions, pr
             "--without is for image sets; a video brings only its pictures: leave out --poses and --points."
         )
     return import_videos(videos, out, options, progress)
+
+
+def _import_raw(folder: Path, out: Path, options: ImportOptions, progress: Progress) -> Session:
+    from capture.importers.raw_stills import import_raw_stills  # loads LibRaw, for RAW files only
+
+    return import_raw_stills(folder, out, options, progress)
 
 
 def _is_video(path: Path) -> bool:

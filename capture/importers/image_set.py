@@ -79,7 +79,7 @@ def write_image_set(
 
     width, height = with_pictures[0].size
     source = describe_source(source, options, bool(posed))
-    with _open_or_create(out, source, width, height, transfer) as session:
+    with open_or_create(out, source, width, height, transfer) as session:
         if warnings or info:
             session.update_info(warnings=warnings, **info)
         present = {record.index for record in session.frames}
@@ -87,7 +87,7 @@ def write_image_set(
             if frame.index not in present:
                 session.append_frame(_copy(frame, session))
             if (mask := masks.get(frame.index)) is not None:
-                _copy_mask(mask, frame, session)
+                copy_mask(mask, frame, session)
             progress("copying pictures", (done + 1) / len(frames))
         if posed:
             session.save_scene_cameras(posed)
@@ -217,12 +217,17 @@ def _existing_masks(frames: Sequence[SourceFrame]) -> dict[int, Path]:
     return named
 
 
-def _open_or_create(out: Path, source: Mapping[str, Any], width: int, height: int, transfer: str) -> Session:
+def open_or_create(
+    out: Path, source: Mapping[str, Any], width: int, height: int, transfer: str, rotation_deg: int = 0
+) -> Session:
+    """A new session, or the one of the same source that an interrupted import left."""
     if (out / "session.json").is_file():
         session = Session.open(out)
         if session.status == "interrupted" and session.info["source"] == source:
             return session
-    return Session.create(out, source=source, width=width, height=height, transfer=transfer)
+    return Session.create(
+        out, source=source, width=width, height=height, transfer=transfer, rotation_deg=rotation_deg
+    )
 
 
 def _copy(frame: SourceFrame, session: Session) -> FrameRecord:
@@ -246,7 +251,7 @@ def _copy(frame: SourceFrame, session: Session) -> FrameRecord:
     )
 
 
-def _copy_mask(mask: Path, frame: SourceFrame, session: Session) -> None:
+def copy_mask(mask: Path, frame: SourceFrame, session: Session) -> None:
     """Copies an 8-bit grey PNG as it is and converts any other picture to one."""
     try:
         pixels = read_image(mask)
