@@ -11,6 +11,7 @@
         └── DeviceError      a camera or flash that does not answer as it must
             ├── CameraError          ... of a camera
             │   ├── CameraGoneError      it is not there any more
+            │   │   └── CameraEndedError     a recording that is played as a camera is over
             │   └── CameraTimeoutError   no frame came in time; also a TimeoutError
             └── FlashError           ... of a flash
                 ├── FlashGoneError       it is not there any more, or its link is dead
@@ -63,6 +64,10 @@ class CameraError(DeviceError):
 
 class CameraGoneError(CameraError):
     """The camera is not there any more."""
+
+
+class CameraEndedError(CameraGoneError):
+    """A recording that is played as a camera is over."""
 
 
 class CameraTimeoutError(CameraError, TimeoutError):

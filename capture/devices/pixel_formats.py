@@ -139,6 +139,28 @@ def luma_levels(format: StreamFormat) -> tuple[float, float] | None:
     return (16.0, 235.0) if format.pixel_format in YUV_FORMATS and not format.full_range else None
 
 
+def yuv_of_rgb(
+    rgb: NDArray[np.uint8], matrix: str, levels: tuple[float, float]
+) -> tuple[NDArray[np.uint8], Chroma]:
+    """Luma and full-size chroma in code values of a picture [H, W, 3]: the inverse of `decode_rgb`.
+
+    Args:
+        rgb: R'G'B'.
+        matrix: "bt601" or "bt709".
+        levels: Code values of black and white in the luma.
+    """
+    red, blue = _LUMA_WEIGHTS[matrix]
+    black, white = levels
+    picture = rgb.astype(np.float32)
+    luma = picture @ np.array([red, 1.0 - red - blue, blue], np.float32)
+    span = (224.0 if black > 0 else 255.0) / 255.0
+    cb = 128.0 + span * (picture[..., 2] - luma) / (2.0 * (1.0 - blue))
+    cr = 128.0 + span * (picture[..., 0] - luma) / (2.0 * (1.0 - red))
+    codes = (np.clip(np.round(plane), 0, 255).astype(np.uint8) for plane in (cb, cr))
+    y = black + luma * ((white - black) / 255.0)
+    return np.clip(np.round(y), 0, 255).astype(np.uint8), (next(codes), next(codes))
+
+
 def frame_bytes(format: StreamFormat) -> int | None:
     """Bytes of a whole frame; None where it varies (JPEG)."""
     name, height = format.pixel_format, format.height
