@@ -53,8 +53,10 @@ class Events:
             say(f"         {detail}", flush=True)
 
     def _output(self):
-        path = self._share / "output.log"
-        return "\n".join(path.read_text(errors="replace").splitlines()[-40:]) if path.exists() else ""
+        """Where the last test was when its time was over, and the last lines of all that was printed."""
+        files = [self._share / "stack.log", self._share / "output.log"]
+        texts = [path.read_text(errors="replace") for path in files if path.exists()]
+        return "\n".join("\n".join(text.splitlines()[-40:]) for text in texts)
 
     def close_run(self, parts, outcome):
         """The parts that are still to be run after a run of the machine.

@@ -3,12 +3,12 @@
 import faulthandler
 import json
 import os
-import sys
 from pathlib import Path
 
 import pytest
 
-EVENTS = Path("/run/machine/share/events.jsonl")
+SHARE = Path("/run/machine/share")
+EVENTS = SHARE / "events.jsonl"
 PART = os.environ["PART"]
 LIMIT_S = float(os.environ["TEST_LIMIT_S"])
 
@@ -21,11 +21,12 @@ def _report(**event):
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item):
     _report(event="start", test=item.name)
-    faulthandler.dump_traceback_later(LIMIT_S, exit=True, file=sys.__stderr__)
-    try:
-        return (yield)
-    finally:
-        faulthandler.cancel_dump_traceback_later()
+    with (SHARE / "stack.log").open("w") as stack:
+        faulthandler.dump_traceback_later(LIMIT_S, exit=True, file=stack)
+        try:
+            return (yield)
+        finally:
+            faulthandler.cancel_dump_traceback_later()
 
 
 _failed = {}
