@@ -3,14 +3,15 @@
 Order of a lock (each step is there because some camera needs it): what the automatics have found is read; the
 stream starts and some frames are dropped, because firmware forgets its controls at a start; automatics off,
 exposure by way of another mode, because a camera can have lost the mode that it says it has; only then the
-values, because they are refused while an automatic is on; last everything is read back.
+values, because they are refused while an automatic is on; everything is read back; last the light is asked,
+which also shows that the stream is this camera's.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import TracebackType
 from typing import Self
 
@@ -24,10 +25,14 @@ from capture.devices.camera import (
     LockReport,
     StreamFormat,
 )
+from capture.devices.light_check import LightCheck, skip_latency, verify_exposure
 from capture.devices.uvc.requests import UvcControls
 from capture.devices.uvc.usb_link import StalledError, UsbLink
 from capture.errors import CameraError, CameraGoneError
 
+_EXPOSURE, _AE_MODE = "exposure_time_absolute", "auto_exposure_mode"
+_UNIT_S = 1e-4  # of the exposure time
+_FRAME_TIMEOUT_S = 2.0
 _MANUAL, _AUTO, _SHUTTER_PRIORITY, _APERTURE_PRIORITY = 1, 2, 4, 8
 _AUTOMATICS = (
     "auto_exposure_priority",
@@ -39,8 +44,8 @@ _AUTOMATICS = (
 )
 #: Control -> the automatic that sets it, and the values of that in which it does.
 _GOVERNED = {
-    "exposure_time_absolute": ("auto_exposure_mode", (_AUTO, _APERTURE_PRIORITY)),
-    "iris_absolute": ("auto_exposure_mode", (_AUTO, _SHUTTER_PRIORITY)),
+    _EXPOSURE: (_AE_MODE, (_AUTO, _APERTURE_PRIORITY)),
+    "iris_absolute": (_AE_MODE, (_AUTO, _SHUTTER_PRIORITY)),
     "white_balance_temperature": ("white_balance_temperature_auto", (1,)),
     "white_balance_blue": ("white_balance_component_auto", (1,)),
     "white_balance_red": ("white_balance_component_auto", (1,)),
@@ -48,13 +53,9 @@ _GOVERNED = {
     "hue": ("hue_auto", (1,)),
     "contrast": ("contrast_auto", (1,)),
 }
-_NEUTRALISED = ("backlight_compensation", "sharpness")  # set to their least value
+_LEAST = ("backlight_compensation", "sharpness")  # set to their least value
+_DEFAULT = ("brightness", "contrast", "saturation", "hue", "gamma")  # whatever was there before us
 _RECORDED = (
-    "brightness",
-    "contrast",
-    "saturation",
-    "hue",
-    "gamma",
     "white_balance_blue",
     "white_balance_red",
     "digital_multiplier",
@@ -80,8 +81,14 @@ class _Setting:
     from_device: Callable[[int], float | None] = float
 
 
+def _seconds(units: float) -> float:
+    return round(units * _UNIT_S, 7)
+
+
 _SETTINGS = (
-    _Setting("exposure_s", "exposure_time_absolute", lambda s: s * 1e4, lambda units: units / 1e4),
+    _Setting(
+        "exposure_s", _EXPOSURE, lambda seconds: seconds / _UNIT_S, lambda units: round(units * _UNIT_S, 7)
+    ),
     _Setting("gain", "gain"),
     _Setting("white_balance_k", "white_balance_temperature"),
     _Setting("focus", "focus_absolute"),
@@ -115,7 +122,7 @@ class UvcCamera:
         Raises:
             CameraError: The stream does not start, or the camera does not answer.
         """
-        first = self._found is None
+        first, earlier = self._found is None, dict(self._locked)
         before = self._readable()
         if self._found is None:
             self._found = before
@@ -131,18 +138,52 @@ class UvcCamera:
         reports = [*self._automatics_off(first)]
         for setting in _SETTINGS:
             reports.extend(self._apply(setting, getattr(profile, setting.field), before, first))
-        for name in _NEUTRALISED:
+        for name in (*_LEAST, *_DEFAULT):
             if name in self._controls:
-                least = self._controls.limits(name).minimum or 0
-                reports.append(self._set(name, name, float(least), float, first, requested=float(least)))
+                limits = self._controls.limits(name)
+                neutral = limits.minimum if name in _LEAST else limits.default
+                value = float(before.get(name, 0) if neutral is None else neutral)
+                reports.append(self._set(name, name, value, float, first, requested=value))
         for name in _RECORDED:
-            if name in self._controls:
-                value = self._controls.get(name)
-                self._locked[name] = value
+            if name in before:
+                self._locked[name] = value = self._controls.get(name)
                 reports.append(ControlReport(name=name, requested=None, read_back=float(value)))
-        fps = [report for report in streamed.controls if report.name == "fps"]
         warnings = [*streamed.warnings, *self._warnings(reports)]
+        exposure = self._locked.get(_EXPOSURE)
+        if exposure is not None and (first or exposure != earlier.get(_EXPOSURE)):
+            warnings += self._check_light(reports, exposure)
+        fps = [report for report in streamed.controls if report.name == "fps"]
         return LockReport(controls=(*fps, *reports), warnings=tuple(warnings))
+
+    def _check_light(self, reports: list[ControlReport], exposure: int) -> list[str]:
+        """Puts the light's verdict into the report of the exposure, after a second try; gives warnings."""
+        check = self._ask_light(exposure)
+        if check.verified is False and self._locked.get(_AE_MODE) is not None:
+            self._force_manual(self._locked[_AE_MODE])
+            self._controls.set(_EXPOSURE, exposure)
+            check = self._ask_light(exposure)
+        index = next(index for index, report in enumerate(reports) if report.name == "exposure_s")
+        notes = [note for note in (reports[index].note, check.note) if note]
+        reports[index] = replace(reports[index], verified=check.verified, note="; ".join(notes))
+        if check.verified:
+            return []
+        doubt = ""
+        if check.verified is False:
+            source = self._stream.info.url
+            doubt = f"; see that {source} is this very camera (stream=...) and no other program sets it"
+        return [f"exposure_s: {check.note}{doubt}."]
+
+    def _ask_light(self, exposure: int) -> LightCheck:
+        def set_exposure(exposure_s: float) -> float:
+            self._controls.set(_EXPOSURE, self._controls.limits(_EXPOSURE).nearest(exposure_s / _UNIT_S))
+            return _seconds(self._controls.get(_EXPOSURE))
+
+        def read() -> CapturedFrame:
+            return self._stream.read(_FRAME_TIMEOUT_S)
+
+        check = verify_exposure(read, lambda: self._stream.format, set_exposure, _seconds(exposure))
+        skip_latency(read)
+        return check
 
     def _readable(self) -> dict[str, int]:
         values = {}
@@ -155,14 +196,12 @@ class UvcCamera:
 
     def _automatics_off(self, first: bool) -> list[ControlReport]:
         reports = []
-        if "auto_exposure_mode" in self._controls:
-            modes = self._controls.modes("auto_exposure_mode")
+        if _AE_MODE in self._controls:
+            modes = self._controls.modes(_AE_MODE)
             wanted = _SHUTTER_PRIORITY if modes & _SHUTTER_PRIORITY and not modes & _MANUAL else _MANUAL
-            detour = next((mode for mode in (_APERTURE_PRIORITY, _AUTO) if modes & mode), None)
-            if first and detour is not None and self._controls.get("auto_exposure_mode") == wanted:
-                self._try_set("auto_exposure_mode", detour)
-            name = "auto_exposure_mode"
-            reports.append(self._set(name, name, wanted, float, first, requested=float(wanted)))
+            if first and self._controls.get(_AE_MODE) == wanted:
+                self._force_manual(wanted)
+            reports.append(self._set(_AE_MODE, _AE_MODE, wanted, float, first, requested=float(wanted)))
         for name in _AUTOMATICS:
             if name in self._controls:
                 reports.append(self._set(name, name, 0.0, float, first, requested=0.0))
@@ -228,18 +267,23 @@ class UvcCamera:
             read = self._controls.get(name)
         return read
 
-    def _try_set(self, name: str, value: int) -> None:
-        with suppress(StalledError):
-            self._controls.set(name, value)
+    def _force_manual(self, manual: int) -> None:
+        """Manual mode by way of another: a camera can have lost the mode that it says it has."""
+        modes = self._controls.modes(_AE_MODE)
+        detour = next((mode for mode in (_APERTURE_PRIORITY, _AUTO) if modes & mode), None)
+        for mode in (detour, manual):
+            if mode is not None:
+                with suppress(StalledError):
+                    self._controls.set(_AE_MODE, mode)
 
     def _warnings(self, reports: list[ControlReport]) -> list[str]:
         warnings = [f"{report.name}: {report.note}." for report in reports if report.note]
-        if "exposure_time_absolute" not in self._controls:
+        if _EXPOSURE not in self._controls:
             warnings.append(
                 f"The {self._link.device} announces no exposure time over USB; light the room evenly and "
                 "check that its pictures do not change by themselves, or use another camera."
             )
-        exposure_s = self._locked.get("exposure_time_absolute", 0) / 1e4
+        exposure_s = _seconds(self._locked.get(_EXPOSURE, 0))
         fps = self._stream.format.fps
         if fps and exposure_s * fps > 1:
             warnings.append(
@@ -289,7 +333,7 @@ class UvcCamera:
         problems = list(self._stream.restore())
         if found is None:
             return tuple(problems)
-        automatics = ("auto_exposure_mode", *_AUTOMATICS)
+        automatics = (_AE_MODE, *_AUTOMATICS)
         values = [name for name in found if name not in automatics and not _was_governed(name, found)]
         for name in (*values, *(name for name in automatics if name in found)):
             try:

@@ -61,8 +61,30 @@ def test_a_lock_sets_what_was_asked_and_reads_it_back(opened: UvcCamera, camera:
     assert camera.cur(PU, 0x04) == 20
     for name in ("exposure_s", "gain", "white_balance_k", "focus", "mains_hz", "fps"):
         control = next(control for control in report.controls if control.name == name)
-        assert (control.read_back, control.note) == (getattr(PROFILE, name), ""), name
+        assert control.read_back == getattr(PROFILE, name), name
+        assert name == "exposure_s" or control.note == ""
     assert report.warnings == ()
+
+
+def test_the_light_confirms_the_exposure(opened: UvcCamera, camera: FakeCamera) -> None:
+    report = opened.lock(PROFILE)
+    assert [control.name for control in report.controls if control.verified is not None] == ["exposure_s"]
+    assert next(control for control in report.controls if control.name == "exposure_s").verified
+    assert camera.cur(CT, 0x04) == 50
+    camera.writes.clear()
+    opened.lock(PROFILE)
+    assert camera.writes == [], "an exposure that is verified and stays is not tried again"
+
+
+def test_the_stream_of_another_camera_is_found_out_by_the_light(
+    camera: FakeCamera, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    device = open_fake(camera, monkeypatch)
+    device._stream = SeeingStream(Bench(VirtualClock()), None)  # nothing here changes its light
+    report = device.lock(PROFILE)
+    assert next(control for control in report.controls if control.name == "exposure_s").verified is False
+    assert any("is this very camera" in warning for warning in report.warnings)
+    assert camera.cur(CT, 0x04) == 50
 
 
 def test_every_automatic_is_off_before_a_value_is_set(opened: UvcCamera, camera: FakeCamera) -> None:
@@ -82,16 +104,22 @@ def test_without_a_wish_what_the_automatics_found_stays(opened: UvcCamera, camer
     assert next(control for control in report.controls if control.name == "exposure_s").requested is None
 
 
-def test_backlight_and_sharpness_go_to_their_least_and_the_rest_is_recorded(
+def test_what_shapes_the_tones_is_neutralised_and_the_rest_is_recorded(
     opened: UvcCamera, camera: FakeCamera
 ) -> None:
+    camera.controls[PU, 0x03].cur = 200  # left by another program
     report = opened.lock(PROFILE)
-    assert (camera.cur(PU, 0x01), camera.cur(PU, 0x08)) == (0, 0)
+    neutral = {
+        "backlight_compensation": 0,
+        "sharpness": 0,
+        "brightness": 0,
+        "contrast": 128,
+        "saturation": 128,
+    }
+    assert {name: report.value(name) for name in neutral} == neutral
+    assert (camera.cur(PU, 0x01), camera.cur(PU, 0x03)) == (0, 128)
     recorded = {control.name: control.read_back for control in report.controls if control.requested is None}
-    assert recorded == {
-        "brightness": -5, "contrast": 128, "saturation": 128,
-        "zoom_absolute": 100, "pan_absolute": 0, "tilt_absolute": 0,
-    }  # fmt: skip
+    assert recorded == {"zoom_absolute": 100, "pan_absolute": 0, "tilt_absolute": 0}
 
 
 def test_a_value_out_of_range_is_clamped_before_it_is_sent_and_said(
