@@ -163,6 +163,8 @@ class CapturedFrame:
             or uint16.
         arrival_s: Host clock when it was handed over.
         damaged: The device says that the frame is incomplete.
+        stamp_estimated: The device's stamp could not be (not later than the one before, or in the future);
+            this one is what the frames before it promise.
         exposure_s: Of this very frame, from devices that say it.
         gain: Likewise.
         camera: Its pose, from a simulated rig.
@@ -173,6 +175,7 @@ class CapturedFrame:
     data: bytes | NDArray[Any]
     arrival_s: float
     damaged: bool = False
+    stamp_estimated: bool = False
     exposure_s: float | None = None
     gain: float | None = None
     camera: Camera | None = None

@@ -174,14 +174,15 @@ def _compare(
             f"with {expected:.2f} of the exposure the light fell to {measured:.2f} and then rose to "
             f"{held / level['before']:.2f}: an automatic is still at work",
         )
-    if abs(level["after"] / level["before"] - 1) > _STEADY:
+    low, high = expected**_LARGEST_EXPONENT, expected**_LEAST_EXPONENT
+    followed = min(shorter, held) <= high * max(level.values())
+    if followed and abs(level["after"] / level["before"] - 1) > _STEADY:
         return LightCheck(
             None,
             expected,
             measured,
             f"not verified with light: it changed by itself, to {level['after'] / level['before']:.2f}",
         )
-    low, high = expected**_LARGEST_EXPONENT, expected**_LEAST_EXPONENT
     if low <= measured <= high:
         return LightCheck(
             True, expected, measured, f"{expected:.2f} of the exposure gives {measured:.2f} of the light"

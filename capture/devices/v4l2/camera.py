@@ -61,7 +61,6 @@ class V4l2Camera:
         self._format: StreamFormat | None = None
         self._stamps = Stamps(None)
         self._first: RawFrame | None = None
-        self._corrected = 0
 
     @property
     def info(self) -> CameraInfo:
@@ -85,11 +84,6 @@ class V4l2Camera:
         if self._format is None:
             raise CameraError(f"{self._node.path} has no format yet; lock the camera first.")
         return self._format
-
-    @property
-    def corrected_stamps(self) -> int:
-        """Frames of this stream whose stamps could not be and were estimated."""
-        return self._corrected
 
     def lock(self, profile: CameraProfile) -> LockReport:
         """Format, rate, stream, settle, automatics off, controls, read-back, light.
@@ -121,20 +115,14 @@ class V4l2Camera:
         self._first = self._first or raw
         stamp_s, estimated = self._stamps.time_s(raw)
         if estimated:
-            self._corrected += 1
-            _log.warning(
-                "%s: frame %d was stamped %.6f s, which cannot be; it was given %.6f s",
-                self._node.path,
-                raw.sequence,
-                raw.stamp_s,
-                stamp_s,
-            )
+            _log.info("%s: frame %d was stamped %.6f s", self._node.path, raw.sequence, raw.stamp_s)
         return CapturedFrame(
             stamp_s=stamp_s,
             sequence=raw.sequence,
             data=raw.data,
             arrival_s=raw.arrival_s,
             damaged=raw.damaged,
+            stamp_estimated=estimated,
         )
 
     def check(self) -> tuple[ControlReport, ...]:
@@ -159,7 +147,7 @@ class V4l2Camera:
         self.close()
 
     def _start(self, choice: Choice, profile: CameraProfile) -> Choice:
-        """Streams in a mode; in a lesser one where the bus has no bandwidth and the profile leaves it open."""
+        """Streams in a mode; in a lesser one where the bus lacks bandwidth and the profile leaves it open."""
         modes = self._node.modes()
         for attempt in range(_BANDWIDTH_TRIES):
             try:

@@ -29,6 +29,9 @@ from capture.devices.v4l2.settings import (
 _LOOKS, _FRAMES_BETWEEN, _SETTLED = 12, 10, 0.02
 #: After the automatics the frozen picture must have the light of the automatic one, within this factor.
 _SAME_LIGHT, _MATCHES = 1.15, 4
+#: White balance and focus stay where their automatic has left them: what a driver says of them in automatic
+#: mode is often old, and written back it would change the picture.
+_LEFT_ALONE = ("white_balance_k", "focus")
 #: Controls of one driver alone (V4L2_CTRL_DRIVER_PRIV) are none of ours.
 _DRIVERS_OWN = 0x1000
 
@@ -50,6 +53,11 @@ class _Locked:
     wanted: int
     asked: float | None
     note: str = ""
+
+    @property
+    def found(self) -> bool:
+        """Whether it is where an automatic has left it, and was not written."""
+        return self.name in _LEFT_ALONE and self.asked is None
 
 
 class ControlLock:
@@ -166,10 +174,11 @@ class ControlLock:
         wanted = {name for name, value in values.items() if value is None and self._control_of(name, known)}
         finders = {identity for name in wanted for identity in FINDERS[name] if identity in known}
         for identity in finders:
-            control = known[identity]
-            entry = automatic_exposure(control) if identity == v4l2.CID_EXPOSURE_AUTO else control.maximum
-            if entry is not None and self._saved.get(identity, (control, None))[1] is not None:
-                self._controls.set(control, entry)
+            automatic = known[identity]
+            is_menu = identity == v4l2.CID_EXPOSURE_AUTO
+            entry = automatic_exposure(automatic) if is_menu else automatic.maximum
+            if entry is not None:
+                self._controls.set(automatic, entry)
         if not wanted:
             return None
         light = self._settled_light() if finders else float(mean_light(self._read, self._format).mean())
@@ -227,9 +236,7 @@ class ControlLock:
         if name == "exposure_s" and found:
             value = without_banding(value, profile.mains_hz)
         note = "as the automatic left it" if found and self._fresh else ""
-        # White balance and focus stay where the automatic has left them; what the driver says of them in
-        # automatic mode is often old, so it is not written.
-        write = not (found and name in ("white_balance_k", "focus"))
+        write = not (found and name in _LEFT_ALONE)
         self._hold(control.id, name, to_device(name, value), asked, note=note, write=write)
 
     def _lock_mains(self, known: dict[int, Control], mains_hz: int | None) -> None:
@@ -256,11 +263,11 @@ class ControlLock:
             return
         number = control.nearest(value)
         notes = [note] if note else []
-        if number != value and asked is not None:
+        if abs(number - value) > 1e-6 * abs(value) and asked is not None:
             notes.append(_why_not(control, value, number, name))
-        if write and (self._fresh or self._controls.get(control) != number):
-            if refusal := self._controls.set(control, number):
-                notes.append(f"refused: {refusal}")
+        differs = write and (self._fresh or self._controls.get(control) != number)
+        if differs and (refusal := self._controls.set(control, number)):
+            notes.append(f"refused: {refusal}")
         self._locked[identity] = _Locked(control, name, number, asked, "; ".join(notes))
 
     def _settle_down(self) -> None:
@@ -314,7 +321,7 @@ class ControlLock:
                 self._controls.set(automatic.control, other)
             self._controls.set(automatic.control, automatic.wanted)
             for held in list(self._locked.values()):
-                if held is not automatic and "as the automatic" not in held.note:
+                if held is not automatic and not held.found:
                     self._controls.set(held.control, held.wanted)
             skip_latency(self._read)
             check = self._verify_once(locked)
@@ -356,8 +363,7 @@ class ControlLock:
         notes = [locked.note] if locked.note else []
         if value is not None and value != locked.wanted:
             held, found = self._reported(locked, locked.wanted), self._reported(locked, value)
-            if "as the automatic left it" not in locked.note:
-                notes.append(f"the device has {found:g}, not {held:g}")
+            notes += [] if locked.found else [f"the device has {found:g}, not {held:g}"]
             locked.wanted = value
         elif value is None:
             notes.append("the device does not tell it")
@@ -403,21 +409,19 @@ class ControlLock:
 
     def _put_back(self, identity: int) -> str:
         """Empty, or a sentence."""
-        control, value = self._saved[identity]
-        control = self._controls.query(identity) or control
+        earlier, value = self._saved[identity]
+        control = self._controls.query(identity) or earlier
         if not control.writable or self._controls.get(control) == value:
             return ""
         refusal = self._controls.set(control, value)
+        if earlier.inactive or earlier.flags & v4l2.CTRL_FLAG_VOLATILE:
+            return ""  # it was what an automatic made of it, and will be again
         if refusal:
             return f"{own_name(control)} could not be put back to {value}: {refusal}."
         found = self._controls.get(control)
-        if found not in (None, value) and not self._volatile(identity):
+        if found not in (None, value):
             return f"{own_name(control)} could not be put back to {value}; the device has {found}."
         return ""
-
-    def _volatile(self, identity: int) -> bool:
-        control = self._controls.query(identity)
-        return control is not None and bool(control.flags & v4l2.CTRL_FLAG_VOLATILE)
 
     def _warn(self, sentence: str) -> None:
         self._warnings.append(sentence)

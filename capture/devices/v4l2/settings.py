@@ -2,8 +2,8 @@
 
 Automatics go first, because they hold the others; a control that one of them holds refuses to be written or
 forgets what was. What changes the picture beyond exposure (backlight compensation, sharpening, effects) is
-neutralised, and the tone controls get the device's defaults: the same pictures, whatever the program before us
-has left behind.
+neutralised, and the tone controls get the device's defaults: the same pictures, whatever the program before
+us has left behind.
 """
 
 from __future__ import annotations
