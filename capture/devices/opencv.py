@@ -32,7 +32,7 @@ from capture.devices.camera import (
 from capture.devices.light_check import LightCheck, skip_latency, verify_exposure
 from capture.devices.opencv_controls import OpenCvControls
 from capture.devices.opencv_reader import Capture, FrameReader
-from capture.devices.settings import split_settings
+from capture.devices.url_options import parse_options
 from capture.errors import CameraError, CameraGoneError, CameraTimeoutError
 
 _DEFAULT_BACKENDS = {"linux": "v4l2", "win32": "dshow", "darwin": "avfoundation"}
@@ -70,7 +70,7 @@ class OpenCvCamera:
 
     @property
     def ended(self) -> bool:
-        """Of a file: whether `read` has found no further frame, which it says with `CameraGoneError`."""
+        """Of a file: whether `read` has found no further frame, which it says with `CameraEndedError`."""
         return self._reader.ended
 
     @property
@@ -187,7 +187,8 @@ class OpenCvCamera:
 
         Raises:
             CameraTimeoutError: None came in time; the next call goes on waiting for it.
-            CameraGoneError: The camera stopped, or the file has ended (`ended`).
+            CameraEndedError: The file is over (`ended`).
+            CameraGoneError: The camera stopped, or it is closed.
         """
         self._require_open()
         if self._format is None:
@@ -241,7 +242,8 @@ def open_camera(rest: str, bench: Bench) -> OpenCvCamera:
         CameraError: It cannot be opened, or a setting is not understood.
     """
     url = f"opencv:{rest}"
-    target, settings = split_settings(url, rest, ("backend", "controls"))
+    target, _, text = rest.partition(";")
+    settings = parse_options(text, {"backend": str, "controls": str}, CameraError, scheme="opencv")
     if settings.get("controls", "leave") != "leave":
         raise CameraError(f"controls={settings['controls']} of {url} is not understood; it is leave.")
     is_file = not target.isdecimal()
@@ -258,10 +260,10 @@ def open_camera(rest: str, bench: Bench) -> OpenCvCamera:
     return OpenCvCamera(url, capture, bench, is_file=is_file, set_controls="controls" not in settings)
 
 
-def list_cameras() -> list[str]:
+def list_cameras() -> tuple[str, ...]:
     """Cameras by trying numbers, which switches them on for a moment; none on Linux, where V4L2 has them."""
     if sys.platform.startswith("linux"):
-        return []
+        return ()
     urls = []
     for index in range(_PROBED):
         try:
@@ -269,7 +271,7 @@ def list_cameras() -> list[str]:
         except CameraError:
             break
         urls.append(f"opencv:{index}")
-    return urls
+    return tuple(urls)
 
 
 def _open(target: int | str, backend: str, url: str) -> Any:

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from capture.devices.bench import Bench
 from capture.devices.camera import CapturedFrame
 from capture.devices.opencv_controls import Properties
-from capture.errors import CameraError, CameraGoneError, CameraTimeoutError
+from capture.errors import CameraEndedError, CameraError, CameraGoneError, CameraTimeoutError
 
 T = TypeVar("T")
 _HANGING_S = 2.0
@@ -84,14 +84,15 @@ class FrameReader:
 
         Raises:
             CameraTimeoutError: None came in time; the next call goes on waiting for it.
-            CameraGoneError: The camera stopped, or the file has ended (`ended`).
+            CameraEndedError: The file is over (`ended`).
+            CameraGoneError: The camera stopped.
         """
         while True:
             picture, stamp_s, arrival_s = self._take(timeout_s)
             if picture is None:
                 if self._is_file:
                     self.ended = True
-                    raise CameraGoneError(f"{self._url} has ended; its last frame has been read.")
+                    raise CameraEndedError(f"{self._url} has ended; its last frame has been read.")
                 raise CameraGoneError(
                     f"{self._url} gives no frames any more; it was unplugged, or another program took it."
                 )

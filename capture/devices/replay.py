@@ -35,15 +35,22 @@ from capture.devices.camera import (
     LockReport,
     StreamFormat,
 )
-from capture.devices.settings import split_settings
-from capture.errors import CameraError, CameraGoneError, CameraTimeoutError, ImageError, SourceError
+from capture.devices.url_options import parse_options
+from capture.errors import (
+    CameraEndedError,
+    CameraError,
+    CameraGoneError,
+    CameraTimeoutError,
+    ImageError,
+    SourceError,
+)
 from capture.images import image_size, read_image
 from capture.importers.image_set import natural_order
 from capture.video import decode_video, probe_video
 from capture.video.colour import rgb_from_frame
 
 _LOG = logging.getLogger(__name__)
-_SETTINGS = ("rate", "loop", "fps")
+_SETTINGS = {"rate": str, "loop": str, "fps": float}
 _PICTURES = frozenset({".png", ".jpg", ".jpeg"})
 _DEFAULT_FPS = 30.0
 _FOREVER = -1
@@ -150,7 +157,7 @@ class ReplayCamera:
     """Plays a recording frame by frame; see the module for what it does not model.
 
     Attributes:
-        ended: Whether `read` has found no further frame, which it says with `CameraGoneError`.
+        ended: Whether `read` has found no further frame, which it says with `CameraEndedError`.
     """
 
     def __init__(
@@ -217,7 +224,8 @@ class ReplayCamera:
 
         Raises:
             CameraTimeoutError: It is due later than that; it is not lost.
-            CameraGoneError: The recording has ended (`ended`), or the camera is closed.
+            CameraEndedError: The recording is over (`ended`).
+            CameraGoneError: The camera is closed.
             CameraError: Not locked yet, or the recording cannot be read any further.
         """
         self._require_open()
@@ -245,7 +253,7 @@ class ReplayCamera:
             raise
         if frame is None:
             self.ended = True
-            raise CameraGoneError(f"The recording {self.info.name} has ended; its last frame has been read.")
+            raise CameraEndedError(f"The recording {self.info.name} has ended; its last frame has been read.")
         return frame
 
     def _wait_until_due(self, stamp_s: float, timeout_s: float) -> None:
@@ -296,7 +304,8 @@ def open_camera(rest: str, bench: Bench) -> ReplayCamera:
         CameraError: It cannot be read, or a setting is not understood.
     """
     url = f"replay:{rest}"
-    target, settings = split_settings(url, rest, _SETTINGS)
+    target, _, text = rest.partition(";")
+    settings = parse_options(text, _SETTINGS, CameraError, scheme="replay")
     rate = settings.get("rate", "real")
     if rate not in ("real", "fast"):
         raise CameraError(f"rate={rate} of {url} is not understood; it is real or fast.")
@@ -309,27 +318,19 @@ def open_camera(rest: str, bench: Bench) -> ReplayCamera:
     )
 
 
-def list_cameras() -> list[str]:
+def list_cameras() -> tuple[str, ...]:
     """None: recordings are not plugged in."""
-    return []
+    return ()
 
 
-def _open_recording(path: Path, url: str, fps: str | None) -> Recording:
+def _open_recording(path: Path, url: str, fps: float | None) -> Recording:
+    if fps is not None and not (math.isfinite(fps) and fps > 0):
+        raise CameraError(f"fps={fps} of {url} is not understood; it is a positive number.")
     if path.is_dir():
-        return PictureFolder(path, _DEFAULT_FPS if fps is None else _positive(url, fps))
+        return PictureFolder(path, fps or _DEFAULT_FPS)
     if fps is not None:
         raise CameraError(f"{url} gives fps, but {path.name} is a video and has its own times; leave it out.")
     return VideoFile(path)
-
-
-def _positive(url: str, text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not (math.isfinite(value) and value > 0):
-        raise CameraError(f"fps={text} of {url} is not understood; it is a positive number.")
-    return value
 
 
 def _loops(url: str, text: str | None) -> int:

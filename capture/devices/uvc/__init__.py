@@ -25,7 +25,7 @@ from pathlib import Path
 
 from capture.devices.bench import Bench
 from capture.devices.camera import CameraDevice, CameraInfo
-from capture.devices.settings import split_settings
+from capture.devices.url_options import parse_options
 from capture.devices.uvc.camera import UvcCamera
 from capture.devices.uvc.descriptors import VideoControl, parse_video_control
 from capture.devices.uvc.requests import UvcControls
@@ -48,7 +48,8 @@ def open_camera(rest: str, bench: Bench) -> CameraDevice:
 def open_uvc(rest: str, bench: Bench, backend: UsbBackend, platform: str = sys.platform) -> UvcCamera:
     """As `open_camera`, through a libusb of the caller's."""
     url = f"uvc:{rest}"
-    target, settings = split_settings(url, rest, ("serial", "stream"))
+    target, _, text = rest.partition(";")
+    settings = parse_options(text, {"serial": str, "stream": str}, CameraError, scheme="uvc")
     match = _TARGET.fullmatch(target)
     if target and match is None:
         raise CameraError(f"{url} is not understood; it is uvc:VID:PID in hexadecimal, as uvc:046d:082d.")
@@ -70,17 +71,17 @@ def open_uvc(rest: str, bench: Bench, backend: UsbBackend, platform: str = sys.p
     return UvcCamera(_info(url, link, interface, controls, stream), link, controls, stream, bench)
 
 
-def list_cameras() -> list[str]:
+def list_cameras() -> tuple[str, ...]:
     """URLs of the cameras that libusb sees, none where V4L2 has them."""
     if Path("/sys/class/video4linux").is_dir():
-        return []
+        return ()
     try:
         return list_uvc(libusb())
     except CameraError:
-        return []
+        return ()
 
 
-def list_uvc(backend: UsbBackend) -> list[str]:
+def list_uvc(backend: UsbBackend) -> tuple[str, ...]:
     """As `list_cameras`; two of a kind are told apart by their serial numbers."""
     cameras = find_cameras(backend)
     kinds = Counter((camera.vendor, camera.product) for camera in cameras)
@@ -90,7 +91,7 @@ def list_uvc(backend: UsbBackend) -> list[str]:
         if kinds[camera.vendor, camera.product] > 1 and (serial := _serial_of(backend, camera)):
             url += f";serial={serial}"
         urls.append(url)
-    return urls
+    return tuple(urls)
 
 
 def _serial_of(backend: UsbBackend, camera: UsbCamera) -> str:

@@ -14,7 +14,7 @@ from capture.devices.bench import Bench, VirtualClock
 from capture.devices.camera import CameraProfile, ControlReport, LockReport
 from capture.devices.opencv import OpenCvCamera
 from capture.devices.table import open_camera
-from capture.errors import CameraError, CameraGoneError, CameraTimeoutError
+from capture.errors import CameraEndedError, CameraError, CameraGoneError, CameraTimeoutError
 from capture.video import VideoWriter
 
 PROFILE = CameraProfile(exposure_s=0.005, gain=20, white_balance_k=5000, focus=0, settle_frames=3)
@@ -243,7 +243,7 @@ def test_opencv_itself_plays_a_file_as_a_camera(film: Path, bench: Bench) -> Non
         assert control(report, "exposure_s").note == "OpenCV cannot set it through FFMPEG"
         assert control(report, "fps").read_back == pytest.approx(25)
         frames = [camera.read(5.0) for _ in range(8)]
-        with pytest.raises(CameraGoneError, match="has ended"):
+        with pytest.raises(CameraEndedError, match="has ended"):
             camera.read(5.0)
         assert camera.ended  # type: ignore[attr-defined]
     assert [frame.sequence for frame in frames] == list(range(8))
@@ -278,5 +278,5 @@ def test_the_numbers_that_open_are_listed(monkeypatch: pytest.MonkeyPatch, bench
     captures = [LyingCapture(bench), LyingCapture(bench), LyingCapture(bench)]
     captures[2].released = True
     monkeypatch.setattr(opencv, "_open", lambda target, backend, url: captures[target])
-    assert opencv.list_cameras() == ["opencv:0", "opencv:1"]
+    assert opencv.list_cameras() == ("opencv:0", "opencv:1")
     assert all(capture.released for capture in captures)

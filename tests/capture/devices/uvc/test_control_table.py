@@ -1,7 +1,7 @@
 """The table of controls against the specification's: the wrong entity sets the gain for the exposure."""
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from capture.devices.uvc.control_table import CONTROLS
@@ -56,6 +56,7 @@ def test_selector_four_is_exposure_in_one_entity_and_gain_in_the_other() -> None
 
 
 @pytest.mark.parametrize("name", sorted(CONTROLS))
+@settings(max_examples=20)
 @given(data=st.data())
 def test_numbers_come_back_and_leave_their_neighbours_alone(name: str, data: st.DataObject) -> None:
     control = CONTROLS[name]

@@ -309,7 +309,7 @@ def test_urls_that_name_no_camera_are_refused(camera: FakeCamera, rest: str, sen
 def test_two_of_a_kind_are_told_apart_by_their_serial_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
     first, second = FakeCamera(), FakeCamera(strings=("HD Pro Webcam C920", "AB12"))
     bus = FakeUsb([first, second])
-    assert uvc.list_uvc(bus) == ["uvc:046d:082d;serial=5D3A9F2E", "uvc:046d:082d;serial=AB12"]
+    assert uvc.list_uvc(bus) == ("uvc:046d:082d;serial=5D3A9F2E", "uvc:046d:082d;serial=AB12")
     with pytest.raises(CameraError, match="2 cameras fit"):
         uvc.open_uvc("046d:082d;stream=wall:", Bench(), bus, "linux")
     monkeypatch.setattr("capture.devices.table.open_camera", lambda url, bench: SeeingStream(bench))
@@ -326,4 +326,4 @@ def test_libusb_that_is_missing_is_said(monkeypatch: pytest.MonkeyPatch) -> None
 def test_without_libusb_nothing_is_listed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("usb.backend.libusb1.get_backend", lambda: None)
     monkeypatch.setattr(Path, "is_dir", lambda self: False)
-    assert uvc.list_cameras() == []
+    assert uvc.list_cameras() == ()
