@@ -151,7 +151,7 @@ class FirmwareFlash:
         self._raise_failure()
         with self._mine():
             if self._needs_hello:
-                shake_hands(self._link)
+                shake_hands(self._link, after_reset=True)
                 self._needs_hello = False
             message = self._in_ticks(train)
             try:

@@ -22,18 +22,25 @@ _BURST_PAUSE_S = 0.03
 _SHOWN_BYTES = 48
 
 
-def shake_hands(link: FirmwareLink, patience_s: float = PATIENCE_S) -> Hello:
+def shake_hands(link: FirmwareLink, *, after_reset: bool = False, patience_s: float = PATIENCE_S) -> Hello:
     """Finds the device, checks its version, learns its clock, and waits until it may flash.
 
-    Takes half a second when the device is there; `patience_s` and a second more at most.
+    Takes half a second when the device is there; `patience_s` and two seconds more at most.
+
+    Args:
+        link: To a device that is not known yet.
+        after_reset: It is known to have started just now.
+        patience_s: How long it may take to answer.
 
     Raises:
         FlashError: Nothing answered, or something that is not this firmware, or another version of it.
         FlashGoneError: The line went away.
     """
-    end_s = link.now_s() + patience_s
+    begin_s = link.now_s()
+    end_s = begin_s + patience_s
     while True:
         hello = _find(link, end_s)
+        found_s = link.now_s()
         link.accept(hello)
         link.heartbeat = True
         for _ in range(BURST):
@@ -43,10 +50,13 @@ def shake_hands(link: FirmwareLink, patience_s: float = PATIENCE_S) -> Hello:
         if clock is not None and clock.fit.ready and not link.restarted:
             break
         link.forget()  # it answered, and only then did the reset come; or its PONGs do not
-    # Counters begin with the device: a young one is still in its second of darkness.
-    age_s = clock.fit.device(link.now_s()) / hello.tick_hz
-    if age_s < DARK_S:
-        _tend_for(link, DARK_S - age_s + _BURST_PAUSE_S)
+    # A counter begins with the device: a young one is in its second of darkness. One that did not answer
+    # at once may have been starting.
+    young_s = clock.fit.device(link.now_s()) / hello.tick_hz
+    if after_reset or found_s - begin_s > HELLO_EACH_S:
+        young_s = min(young_s, link.now_s() - found_s)
+    if young_s < DARK_S:
+        _tend_for(link, DARK_S - young_s + _BURST_PAUSE_S)
     return hello
 
 

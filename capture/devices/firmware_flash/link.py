@@ -158,6 +158,9 @@ class FirmwareLink:
             self._waiting.pop(seq, None)
             self._answers.pop(seq, None)
         if isinstance(answer, Err):
+            if answer.code == ErrorCode.STALE_NONCE:
+                self._note_reset()
+                raise self.take_trouble() or _reset_error(self.description)
             raise refusal(answer, message, self.description)
         return answer
 
@@ -188,7 +191,7 @@ class FirmwareLink:
                 self._hear(item, arrived_s)
             else:
                 self.faults.append(item)
-        if self.heartbeat and arrived_s - self._heard_s > SILENT_S:
+        if self.heartbeat and not self._waiting and arrived_s - self._heard_s > SILENT_S:
             raise FlashGoneError(
                 f"{self.description} has been silent for {arrived_s - self._heard_s:.1f} s; its light has "
                 "gone out by itself. Check its cable and its power, then start again."
@@ -310,7 +313,5 @@ def refusal(err: Err, message: Message, description: str) -> FlashError:
         ErrorCode.HEARTBEAT: "had put its light out because nothing was heard from this program",
         ErrorCode.UNSUPPORTED: "cannot dim its light; use level 1",
     }
-    if err.code == ErrorCode.STALE_NONCE:
-        return _reset_error(description)
     known = {int(code): text for code, text in reasons.items()}
     return FlashError(f"{description} {known.get(err.code, f'refuses {name} with error {err.code}')}.")
