@@ -27,6 +27,10 @@ _COMMANDS = {
         "relight.commands.calibrate",
         "print a board, and find a camera's lens from pictures of it",
     ),
+    "doctor": (
+        "relight.commands.doctor",
+        "what is plugged in, what works, and what to do about what does not",
+    ),
 }
 
 _ABOUT = "From a blinking flash to a relightable head."

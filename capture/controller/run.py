@@ -249,11 +249,9 @@ class _Capture:
         index = self._next_index
         self._next_index += 1
         lost = self._counts.frame(frame)
-        remarks = [
-            reason
-            for reason, applies in (("dropped_before", lost > 0), ("stamp_repaired", not sound_stamp))
-            if applies
-        ]
+        remarks = ["dropped_before"] if lost else []
+        if frame.stamp_estimated or not sound_stamp:
+            remarks.append("stamp_repaired")
         looked = None if frame.damaged else self._looker.look(index, pts_s, frame)
         if looked is None:
             self._counts.damaged += 1

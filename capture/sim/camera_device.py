@@ -139,12 +139,14 @@ class SimulatedCamera:
                 warnings.append(f"{name}: {note}.")
             setattr(self, f"_{name}", value)
             controls.append(ControlReport(name=name, requested=wish, read_back=value, note=note))
-        fixed = {"fps": (profile.fps, self._rig.config.fps), "width": (profile.width, self._format.width)}
-        for name, (wish, found) in fixed.items():
-            note = "" if wish in (None, found) else f"asked for {wish:g}, the rig has {found:g}"
-            if note:
-                warnings.append(f"{name}: {note}.")
-            controls.append(ControlReport(name=name, requested=wish, read_back=float(found), note=note))
+        fps = self._rig.config.fps
+        note = "" if profile.fps in (None, fps) else f"asked for {profile.fps:g}, the rig has {fps:g}"
+        controls.append(ControlReport(name="fps", requested=profile.fps, read_back=fps, note=note))
+        size = (self._format.width, self._format.height)
+        if (profile.width or size[0], profile.height or size[1]) != size:
+            warnings.append(
+                f"The rig's pictures are {size[0]} x {size[1]}, not {profile.width} x {profile.height}."
+            )
         self._locked = {"exposure_s": self._exposure_s, "gain": self._gain}
         return LockReport(controls=tuple(controls), warnings=tuple(warnings))
 
