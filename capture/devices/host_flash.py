@@ -16,7 +16,7 @@ import weakref
 from types import TracebackType
 from typing import Any, Protocol, Self
 
-from capture.devices.bench import Clock, VirtualClock
+from capture.devices.bench import Clock, MonotonicClock
 from capture.devices.flash import LONGEST_ON_S, FlashCapabilities, FlashEdge, FlashInfo, PulseTrain
 from capture.devices.host_schedule import LATEST_S, HostSchedule, Step
 from capture.errors import FlashError, FlashGoneError
@@ -27,6 +27,8 @@ _log = logging.getLogger(__name__)
 LEAD_S = 0.02
 #: The thread looks up at least so often whether it is still wanted.
 _IDLE_S = 1.0
+#: A lamp that did not take its command off is told again so often, each so many seconds.
+_RETRIES, _RETRY_S = 20, 0.1
 #: How long `off` waits for a command that hangs before it goes ahead regardless.
 _PATIENCE_S = 1.0
 
@@ -80,17 +82,21 @@ class HostFlash:
         """
         self._lamp = lamp
         self._clock = clock
-        self._schedule = HostSchedule(lamp.capabilities.jitter_s or 0.0)
+        can = lamp.capabilities
+        self._schedule = HostSchedule(can.latency_s or 0.0, can.jitter_s or 0.0)
         self._edges: list[FlashEdge] = []
         self._error: FlashError | None = None
         self._raised = False
         self._closed = False
+        self._retries = 0
+        self._retry_s = 0.0
         # Reentrant: `off` may come from a signal's handler in the middle of `poll`.
         self._lock = threading.RLock()
         self._wake = threading.Event()
         # Dark too when nobody closes it: at the end of the program, or when it is forgotten.
         self._finalizer = weakref.finalize(self, _darken, lamp)
-        if not isinstance(clock, VirtualClock):
+        self._threaded = isinstance(clock, MonotonicClock)
+        if self._threaded:
             wanted = (weakref.ref(self), self._wake)
             threading.Thread(target=_serve, args=wanted, name=lamp.info.back_end, daemon=True).start()
 
@@ -117,6 +123,7 @@ class HostFlash:
             step = self._schedule.drop()
             if step is not None:
                 self._carry_out(step)
+            self._retries = 0
             self._lamp.prepare(train.level)
             self._schedule.start(train)
         self._wake.set()
@@ -128,7 +135,7 @@ class HostFlash:
             FlashError: What went wrong; edges from before come out of the call after.
         """
         with self._lock:
-            if isinstance(self._clock, VirtualClock):
+            if not self._threaded:
                 self.run_due()
             if not self._closed and self._error is None:
                 next_s = self._schedule.next_s()
@@ -169,11 +176,15 @@ class HostFlash:
 
     def next_s(self) -> float | None:
         """When `run_due` has something to do; None = never."""
-        return self._schedule.next_s()
+        if self._retries:
+            return self._retry_s
+        return None if self._error is not None else self._schedule.next_s()
 
     def run_due(self) -> None:
         """Does what is due by now. The thread's work; in simulated time its caller's."""
         with self._lock:
+            if self._retries and not self._closed and self._clock.now_s() >= self._retry_s:
+                self._try_dark()
             while not self._closed and self._error is None:
                 step = self._schedule.due(self._clock.now_s())
                 if step is None:
@@ -242,16 +253,26 @@ class HostFlash:
             )
 
     def _fail(self, error: Exception) -> None:
-        step = self._schedule.drop()
         if not isinstance(error, FlashError):
             _log.exception("The thread of %s failed", self._lamp.info.name, exc_info=error)
             error = FlashError(f"{self._lamp.info.name} failed ({error}); start again.")
         self._error, self._raised = error, False
-        with contextlib.suppress(Exception):  # the failure is told already
-            before_s = self._clock.now_s()
+        self._retries = _RETRIES
+        self._try_dark()
+
+    def _try_dark(self) -> None:
+        step = self._schedule.drop()
+        before_s = self._clock.now_s()
+        try:
             self._lamp.switch(False)
-            if step is not None:
-                self._edges.append(self._schedule.done(step, before_s, self._clock.now_s()))
+        except Exception as error:  # the failure is told already
+            self._retries -= 1
+            self._retry_s = self._clock.now_s() + _RETRY_S
+            _log.debug("%s does not go out: %s", self._lamp.info.name, error)
+            return
+        self._retries = 0
+        if step is not None:
+            self._edges.append(self._schedule.done(step, before_s, self._clock.now_s()))
 
     def _raise_error(self) -> None:
         error = self._error
@@ -268,7 +289,7 @@ class HostFlash:
         with self._lock:
             if self._closed:
                 return None
-            next_s = None if self._error is not None else self._schedule.next_s()
+            next_s = self.next_s()
             if next_s is None:
                 return _IDLE_S
             return min(_IDLE_S, max(0.0, next_s - self._clock.now_s()))

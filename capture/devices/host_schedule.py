@@ -44,18 +44,19 @@ class HostSchedule:
         latest_s: The worst delay of a beginning.
     """
 
-    def __init__(self, jitter_s: float = 0.0) -> None:
+    def __init__(self, latency_s: float = 0.0, jitter_s: float = 0.0) -> None:
         """Nothing to do yet.
 
         Args:
-            jitter_s: Standard deviation of the lamp's delay, to be added to what the commands leave open.
+            latency_s: From the command to the light, by which edges are later than commands.
+            jitter_s: Standard deviation of that, to be added to what the commands leave open.
         """
         self.skipped: list[int] = []
         self.made = 0
         self.last_on_s = 0.0
         self.longest_on_s = 0.0
         self.latest_s = 0.0
-        self._jitter_s = jitter_s
+        self._latency_s, self._jitter_s = latency_s, jitter_s
         self._train: PulseTrain | None = None
         self._pulse = 0
         self._lit_s: float | None = None
@@ -106,7 +107,8 @@ class HostSchedule:
         """Takes note that a step was made, by a command that was given `before_s` and taken by `after_s`.
 
         Returns:
-            The edge: in the middle of the two, uniform between them, and uncertain by the lamp's jitter.
+            The edge: the lamp's latency after the middle of the two; uniform between them, and uncertain by
+            the lamp's jitter.
         """
         if step.on:
             self.latest_s = max(self.latest_s, before_s - self._nominal_s())
@@ -121,7 +123,8 @@ class HostSchedule:
             self.longest_on_s = max(self.longest_on_s, self.last_on_s)
             self._lit_s, self._off_s = None, math.inf
         sigma_s = math.hypot((after_s - before_s) / math.sqrt(12), self._jitter_s)
-        return FlashEdge(time_s=(before_s + after_s) / 2, sigma_s=sigma_s, on=step.on, pulse=step.pulse)
+        time_s = (before_s + after_s) / 2 + self._latency_s
+        return FlashEdge(time_s=time_s, sigma_s=sigma_s, on=step.on, pulse=step.pulse)
 
     def report(self) -> dict[str, Any]:
         """What became of the flashes: plain values for session.json."""

@@ -1,8 +1,8 @@
 """A lamp that nobody here controls: `manual:`, or one that blinks by itself: `manual:period=1;on=0.1`.
 
-A person switches it by hand, or it is a phone whose camera program flashes its own torch. There is no line to
-it: `start` says what to do, `poll` knows of no edge, `off` asks the person. Which frames are lit is told by the
-frames alone.
+A person switches it by hand, or it is a phone whose camera program flashes its own torch. There is no line
+to it: `start` says what to do, `poll` knows of no edge, `off` asks the person. Which frames are lit is told
+by the frames alone.
 """
 
 from __future__ import annotations
@@ -104,13 +104,13 @@ class ManualFlash:
         self._running = True
         if self._period_s is not None:
             self._tell(
-                f"Let the lamp blink now, every {self._period_s:g} s for {self._on_s:g} s; it is not controlled "
-                "from here."
+                f"Let the lamp blink now, every {self._period_s:g} s for {self._on_s:g} s; it is not "
+                "controlled from here."
             )
         else:
             self._tell(
-                f"Switch the lamp on for {train.on_s:g} s every {train.period_s:g} s, {train.count} times; it "
-                "is not controlled from here."
+                f"Switch the lamp on for {train.on_s:g} s every {train.period_s:g} s, {train.count} times; "
+                "it is not controlled from here."
             )
 
     def poll(self) -> tuple[FlashEdge, ...]:

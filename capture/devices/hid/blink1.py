@@ -8,9 +8,9 @@ The watchdog does not turn the light off: when nothing tickles it in time, the d
 it leaves the factory coloured flashes without end. So the pattern is made black while we use it: on mk2 and
 mk3 it is in RAM until it is saved, and we save nothing, write all lines back at the end, and unplugging
 restores it too. All lines, because a mk3's firmware plays all of them whatever part it was told; with a time
-of 10 ms, because it skips black lines without one. Byte 5 of D is 1: with 0 each D turns the light off at once
-(firmware in todbot/blink1 and todbot/blink1mk3). The mk1 keeps its pattern in EEPROM: we leave it alone, and it
-has no watchdog here.
+of 10 ms, because it skips black lines without one. Byte 5 of D is 1: with 0 each D turns the light off at
+once (firmware in todbot/blink1 and todbot/blink1mk3). The mk1 keeps its pattern in EEPROM: we leave it alone,
+and it has no watchdog here.
 """
 
 from __future__ import annotations

@@ -33,7 +33,7 @@ from capture.errors import FlashError
 _log = logging.getLogger(__name__)
 
 VENDOR_ID, PRODUCT_ID = 0x16C0, 0x05DF
-_PRODUCT = re.compile(r"USBRelay([1-8])$")
+_PRODUCT = re.compile(r"USBRelay([1-8])")
 _CLOSE, _OPEN = 0xFF, 0xFD
 _STATE_REPORT, _REPORT_BYTES, _STATE_BYTES = 1, 9, 8
 #: Reading the state takes a slow device some milliseconds: not when a switch is due.
@@ -41,8 +41,8 @@ _READ_S = 0.1
 #: No more than so often.
 _CHECK_S = 1.0
 _WEAR = (
-    "a mechanical relay wears out after some 100,000 to 1,000,000 operations, and one flash a second is 3,600 "
-    "an hour; prefer a solid-state one"
+    "a mechanical relay wears out after some 100,000 to 1,000,000 operations, and one flash a second is "
+    "3,600 an hour; prefer a solid-state one"
 )
 _OPTIONS = {"serial": str, "path": str, "channel": int}
 
@@ -189,11 +189,11 @@ def read_state(transport: HidTransport) -> tuple[str, int]:
 
 
 def _find_boards() -> list[HidAddress]:
-    return [board for board in find_devices(VENDOR_ID, (PRODUCT_ID,)) if _PRODUCT.match(board.product)]
+    return [board for board in find_devices(VENDOR_ID, (PRODUCT_ID,)) if _PRODUCT.fullmatch(board.product)]
 
 
 def _channels(address: HidAddress) -> int:
-    named = _PRODUCT.match(address.product)
+    named = _PRODUCT.fullmatch(address.product)
     if named is None:
         raise FlashError(f"{address.description} is no USBRelay board, though it has the same USB number.")
     return int(named[1])
