@@ -96,11 +96,22 @@ class FrameReader:
                 raise CameraGoneError(
                     f"{self._url} gives no frames any more; it was unplugged, or another program took it."
                 )
+            usual_s = self._usual_interval_s()
+            estimated = False
             if not self.stamped:
                 stamp_s = arrival_s
-            if self._count(stamp_s):
-                rgb = _as_rgb(picture, self._url)
-                return CapturedFrame(stamp_s=stamp_s, sequence=self._sequence, data=rgb, arrival_s=arrival_s)
+            elif self._last_s is not None and stamp_s <= self._last_s:
+                if usual_s is None:
+                    continue  # nothing is known of its time: left out
+                stamp_s, estimated = self._last_s + usual_s, True
+            self._count(stamp_s, usual_s)
+            return CapturedFrame(
+                stamp_s=stamp_s,
+                sequence=self._sequence,
+                data=_as_rgb(picture, self._url),
+                arrival_s=arrival_s,
+                stamp_estimated=estimated,
+            )
 
     def _take(self, timeout_s: float) -> tuple[NDArray[Any] | None, float, float]:
         if self._pending is None:
@@ -128,21 +139,20 @@ class FrameReader:
             self._bench.clock.sleep(_RETRY_S)
         return None, 0.0, 0.0
 
-    def _count(self, stamp_s: float) -> bool:
-        """Counts a frame and those that are missing before it; False for one that is not later: left out."""
+    def _usual_interval_s(self) -> float | None:
+        """Between frames, measured: in a dim room a camera need not keep to the rate that it promises."""
+        return statistics.median(self._intervals_s) if len(self._intervals_s) >= _KNOWN_AFTER else None
+
+    def _count(self, stamp_s: float, usual_s: float | None) -> None:
+        """Counts a frame, and those that are missing before it."""
         step = 1
         if self._last_s is not None:
             passed_s = stamp_s - self._last_s
-            if passed_s <= 0 and self.stamped:
-                return False
-            # A camera need not keep to the rate that it promises: in a dim room it takes its time.
-            usual_s = statistics.median(self._intervals_s) if len(self._intervals_s) >= _KNOWN_AFTER else None
             if self.stamped and usual_s is not None and passed_s > _GAP * usual_s:
                 step = round(passed_s / usual_s)
             self._intervals_s.append(passed_s / step)
         self._sequence += step
         self._last_s = stamp_s
-        return True
 
     def run(self, work: Callable[[], T]) -> T:
         """Does something with the capture in the thread, which OpenCV does not let two do at once.

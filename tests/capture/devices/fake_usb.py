@@ -320,6 +320,8 @@ class SeeingStream:
     def read(self, timeout_s: float) -> CapturedFrame:
         if self.closed or (self._camera is not None and self._camera.unplugged):
             raise CameraGoneError("The wall is gone.")
+        if self.profile is None:
+            raise CameraError("The wall is not locked.")
         self._bench.clock.sleep(1 / 30)
         self._sequence += 1
         self._pipeline.append(self._exposure_s())

@@ -172,13 +172,14 @@ def test_a_longer_time_between_two_stamps_is_a_gap(camera: OpenCvCamera, capture
     assert sequence == [1, 3, 4, 7, 8]
 
 
-def test_a_frame_whose_stamp_is_not_later_is_left_out(camera: OpenCvCamera, capture: LyingCapture) -> None:
+def test_a_stamp_that_cannot_be_is_estimated_and_says_so(camera: OpenCvCamera, capture: LyingCapture) -> None:
     camera.lock(CameraProfile(settle_frames=8))
-    first = camera.read(1.0)
-    capture.repeated = {capture._number + 1}
-    second = camera.read(1.0)
-    assert second.stamp_s > first.stamp_s
-    assert second.sequence - first.sequence == 2
+    capture.repeated = {capture._number + 2}
+    frames = [camera.read(1.0) for _ in range(4)]
+    assert [frame.stamp_estimated for frame in frames] == [False, True, False, False]
+    # The wall's frames are evenly spaced: the estimate is exact but for milliseconds kept in doubles.
+    assert np.diff([frame.stamp_s for frame in frames]) == pytest.approx([1 / 30] * 3, abs=1e-9)
+    assert np.diff([frame.sequence for frame in frames]).tolist() == [1, 1, 1]
 
 
 def test_stamps_of_v4l2_are_the_hosts(camera: OpenCvCamera, bench: Bench) -> None:
