@@ -73,8 +73,8 @@ class SteppedCore:
     """The firmware in this process. There is one: a second takes the place of the first.
 
     Attributes:
-        edges: (seconds, on) by the device's clock.
-        now_us: The device's clock.
+        edges: (seconds, on) since it was made, by its own clock.
+        now_us: Since it was made.
     """
 
     IDLE = 0
@@ -91,26 +91,27 @@ class SteppedCore:
         self._core.host_reset.argtypes = [ctypes.c_uint32, ctypes.c_uint8]
         self.edges = []
         self._out = bytearray()
-        self._zero_us = clock_us
-        self.now_us = 0
+        self.now_us = self._reset_us = 0
         self._nonce = 0x1234
-        self._core.host_set_clock(clock_us)
-        self.reset()
+        self.reset(clock_us)
 
     def _on_edge(self, edge):
-        tick = (edge.contents.tick - self._zero_us) % 2**64
-        self.edges.append((tick / US, edge.contents.on))
+        since_us = (edge.contents.tick - self._clock_us) % 2**64
+        self.edges.append(((self._reset_us + since_us) / US, edge.contents.on))
 
     def _on_sent(self, byte):
         self._out.append(byte)
 
-    def reset(self):
+    def reset(self, clock_us=0):
+        """The counter begins anew, as a chip's does."""
+        self._reset_us, self._clock_us = self.now_us, clock_us
+        self._core.host_set_clock(clock_us)
         self._nonce = (self._nonce * 1_103_515_245 + 12_345) % 2**32 or 1
         self._core.host_reset(self._nonce, self.IDLE)
 
     def advance(self, us):
         self.now_us += us
-        self._core.host_advance((self._zero_us + self.now_us) % 2**64)
+        self._core.host_advance((self._clock_us + self.now_us - self._reset_us) % 2**64)
 
     def feed(self, data):
         self._core.host_receive(bytes(data), len(data))
@@ -251,6 +252,10 @@ class StepLine:
         self._out.clear()
         self._check()
         return data
+
+    def take_all(self):
+        """What has come and nobody has read, as a driver forgets it when its port is opened anew."""
+        self._out.clear()
 
     def close(self):
         self.closed = True

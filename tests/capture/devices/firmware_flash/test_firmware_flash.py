@@ -30,12 +30,6 @@ class SteppedRig(FlashRig):
         """Nobody polls any more: the whole host is what the test's thread does."""
 
 
-@pytest.fixture(scope="session")
-def firmware_directory(tmp_path_factory):
-    base = tmp_path_factory.getbasetemp()
-    return (base.parent if base.name.startswith("popen-") else base) / "flash_doubles"
-
-
 @pytest.fixture
 def core(firmware_directory):
     device = SteppedCore(build(firmware_directory, "core"))
