@@ -149,6 +149,7 @@ class V4l2Camera:
     def _start(self, choice: Choice, profile: CameraProfile) -> Choice:
         """Streams in a mode; in a lesser one where the bus lacks bandwidth and the profile leaves it open."""
         modes = self._node.modes()
+        said_before: tuple[str, ...] = ()
         for attempt in range(_BANDWIDTH_TRIES):
             try:
                 self._start_mode(choice)
@@ -169,7 +170,8 @@ class V4l2Camera:
                     f"{given_up.pixel_format}; {choice.mode.width} x {choice.mode.height} "
                     f"{choice.mode.pixel_format} was taken."
                 )
-                choice = Choice(choice.mode, choice.fps, (*choice.warnings, said))
+                said_before += (said,)
+                choice = Choice(choice.mode, choice.fps, (*choice.warnings, *said_before))
         raise CameraError(f"{self._node.path} cannot start to stream.")
 
     def _start_mode(self, choice: Choice) -> None:
