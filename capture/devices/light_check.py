@@ -21,6 +21,8 @@ from capture.transfer import to_linear
 
 #: Frames in flight when a control is set, and the two or three that a sensor takes to follow.
 LATENCY_FRAMES = 6
+#: Buffers of a driver, at most; frames that come faster than this share of their interval have waited there.
+_WAITING_FRAMES, _AT_ONCE = 32, 0.3
 #: Frames that are averaged: noise, and most of the mains' flicker.
 MEASURED_FRAMES = 6
 #: An automatic takes about a second to fill up what was taken away.
@@ -139,8 +141,13 @@ def verify_exposure(
 
 
 def skip_latency(read: Callable[[], CapturedFrame]) -> None:
-    """Lets the frames pass that were under way before a control was set."""
-    for _ in range(LATENCY_FRAMES):
+    """Lets the frames pass that were under way before a control was set, in buffers and in the camera."""
+    frame = read()
+    for _ in range(_WAITING_FRAMES):
+        before, frame = frame, read()
+        if frame.arrival_s - before.arrival_s > _AT_ONCE * (frame.stamp_s - before.stamp_s):
+            break  # it had to be waited for: no older one is left in the buffers
+    for _ in range(LATENCY_FRAMES - 2):
         read()
 
 

@@ -165,6 +165,8 @@ class V4l2Camera:
                     choice = choose_mode(modes, profile, self._node.path)
                 except CameraError:
                     raise error from cause
+                if profile.width is not None and _size(choice.mode) != _size(given_up):
+                    raise error from cause
                 said = (
                     f"The USB bus has no bandwidth for {given_up.width} x {given_up.height} "
                     f"{given_up.pixel_format}; {choice.mode.width} x {choice.mode.height} "
@@ -233,6 +235,10 @@ class V4l2Camera:
         if not self._first.monotonic:
             return "arrival"
         return "start of exposure" if self._first.stamped_at_start else "end of frame"
+
+
+def _size(mode: Mode) -> tuple[int, int]:
+    return mode.width, mode.height
 
 
 def _differ(choice: Choice, other: Choice) -> bool:

@@ -251,8 +251,7 @@ def test_a_stream_that_the_driver_gives_up_is_an_error_that_says_what_to_do(make
     with pytest.raises(
         CameraError, match=r"link to the camera has failed \(EIO\); plug it in again"
     ) as failed:
-        for _ in range(400):
-            camera.read(1.0)
+        read_on(camera)
     assert not isinstance(failed.value, CameraGoneError)
 
 
