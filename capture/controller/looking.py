@@ -62,6 +62,15 @@ class LookedFrame:
     stream_format: StreamFormat
 
     @cached_property
+    def shown(self) -> NDArray[np.uint8]:
+        """[h, w] display values of the luma, full range."""
+        luma = self._eight_bits(self.luma)
+        black, white = luma_levels(self.stream_format) or (0.0, 255.0)
+        if (black, white) == (0.0, 255.0) or self.small.ndim == 3:
+            return luma
+        return np.asarray(cv2.LUT(luma, _stretch(black, white)), np.uint8)
+
+    @cached_property
     def rgb(self) -> NDArray[np.uint8]:
         """[h, w, 3] R'G'B'; computed when it is asked for."""
         if self.small.ndim == 3:
@@ -89,6 +98,11 @@ class LookedFrame:
             else picture / 65535
         )
         return (255 * shown).astype(np.uint8)
+
+
+def _stretch(black: float, white: float) -> NDArray[np.uint8]:
+    """Table from code values to full range."""
+    return np.clip(np.round((np.arange(256) - black) * 255.0 / (white - black)), 0, 255).astype(np.uint8)
 
 
 class Watch(Protocol):

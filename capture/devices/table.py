@@ -9,6 +9,7 @@ end's module has `open_camera(rest, bench)` or `open_flash(rest, bench)`, and `l
 from __future__ import annotations
 
 import importlib
+import logging
 import re
 from collections.abc import Mapping
 from types import ModuleType
@@ -17,6 +18,8 @@ from capture.devices.bench import Bench, MonotonicClock, VirtualClock
 from capture.devices.camera import CameraDevice
 from capture.devices.flash import FlashDevice
 from capture.errors import CameraError, DeviceError, FlashError
+
+logger = logging.getLogger(__name__)
 
 CAMERAS: Mapping[str, str] = {
     "v4l2": "capture.devices.v4l2",
@@ -77,6 +80,16 @@ def open_flash(url: str, bench: Bench | None = None) -> FlashDevice:
     return flash
 
 
+def list_cameras() -> tuple[str, ...]:
+    """URLs of the cameras that are plugged in; nothing is opened that opening would change."""
+    return _listed(CAMERAS, "list_cameras")
+
+
+def list_flashes() -> tuple[str, ...]:
+    """URLs of the flashes that may be plugged in; a serial port is one until it has been asked."""
+    return _listed(FLASHES, "list_flashes")
+
+
 def camera_scheme(url: str) -> tuple[str, str]:
     """(scheme, rest) of a camera's URL; a number is /dev/videoN."""
     if url.isdecimal():
@@ -91,6 +104,17 @@ def flash_scheme(url: str) -> tuple[str, str]:
     if url.startswith("/") or url.upper().startswith("COM") or url.split(":")[0] in _PORT_SCHEMES:
         return "serial", url
     return _split(url)
+
+
+def _listed(table: Mapping[str, str], function: str) -> tuple[str, ...]:
+    """Of all back ends; one whose library or system is missing has none."""
+    urls: list[str] = []
+    for module_name in dict.fromkeys(table.values()):
+        try:
+            urls += getattr(importlib.import_module(module_name), function)()
+        except DeviceError as error:
+            logger.info("%s: %s", module_name, error)
+    return tuple(urls)
 
 
 def _split(url: str) -> tuple[str, str]:

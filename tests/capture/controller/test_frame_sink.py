@@ -65,11 +65,16 @@ def test_a_full_disk_comes_out_of_the_next_put_and_what_is_logged_is_whole(sessi
         whole(line)
 
     monkeypatch.setattr(session, "append_frame", full_after_three)
-    with pytest.raises(SessionError, match="ENOSPC"), FrameSink(session, FORMAT) as sink:
-        for k in range(200):
-            sink.put(record(k), picture(k))
-            time.sleep(0.001)
-        sink.drain()
+
+    def take_all():
+        with FrameSink(session, FORMAT) as sink:
+            for k in range(200):
+                sink.put(record(k), picture(k))
+                time.sleep(0.001)
+            sink.drain()
+
+    with pytest.raises(SessionError, match="ENOSPC"):
+        take_all()
     assert [frame.index for frame in session.frames] == [0, 1, 2]
 
 

@@ -6,6 +6,7 @@ import pytest
 from capture.controller.config import CaptureConfig
 from capture.controller.stop_rules import StopRules
 from capture.devices.camera import ControlReport
+from capture.tagging.watch import PulseStatus
 
 Usage = namedtuple("Usage", "free")
 
@@ -32,10 +33,21 @@ def test_black_frames_stop_unless_a_flash_is_among_them(rules):
     assert "lens cap" in [rules.of_light(1e-5, 0.0) for _ in range(70)][-1]
 
 
-def test_a_flash_that_is_never_seen_stops_after_four_and_one_that_was_does_not(rules):
-    assert rules.of_pulses(3, 0) is None
-    assert "4 flashes were due" in rules.of_pulses(4, 0)
-    assert rules.of_pulses(40, 1) is None
+def status(seen=0, expected=0, unseen=0):
+    return PulseStatus(seen, expected, unseen, None, 0.0)
+
+
+def test_four_reported_flashes_in_a_row_that_are_not_seen_stop(rules):
+    assert rules.of_pulses(status(expected=3, unseen=3), 5.0) is None
+    assert "The last 4 flashes are not seen" in rules.of_pulses(status(expected=4, unseen=4), 5.0)
+    assert "not seen" in rules.of_pulses(status(seen=9, expected=13, unseen=4), 14.0)
+    assert rules.of_pulses(status(seen=12, expected=13), 14.0) is None
+
+
+def test_a_flash_that_reports_nothing_is_waited_for_longer(rules):
+    assert rules.of_pulses(status(), 10.9) is None
+    assert "for 11 s" in rules.of_pulses(status(), 11.1)
+    assert rules.of_pulses(status(seen=1), 60.0) is None
 
 
 def test_controls_that_drifted_stop_when_they_are_seen_twice(rules):
