@@ -87,14 +87,14 @@ class HostFlash:
         self._edges: list[FlashEdge] = []
         self._error: FlashError | None = None
         self._raised = False
-        self._closed = False
+        self._closed = threading.Event()
         self._retries = 0
         self._retry_s = 0.0
         # Reentrant: `off` may come from a signal's handler in the middle of `poll`.
         self._lock = threading.RLock()
         self._wake = threading.Event()
         # Dark too when nobody closes it: at the end of the program, or when it is forgotten.
-        self._finalizer = weakref.finalize(self, _darken, lamp)
+        self._finalizer = weakref.finalize(self, _darken, lamp, self._lock, self._closed)
         self._threaded = isinstance(clock, MonotonicClock)
         if self._threaded:
             wanted = (weakref.ref(self), self._wake)
@@ -137,7 +137,7 @@ class HostFlash:
         with self._lock:
             if not self._threaded:
                 self.run_due()
-            if not self._closed and self._error is None:
+            if not self._closed.is_set() and self._error is None:
                 next_s = self._schedule.next_s()
                 idle_s = float("inf") if next_s is None else next_s - self._clock.now_s()
                 try:
@@ -155,7 +155,7 @@ class HostFlash:
         """Puts the light out and drops the train; whether the lamp says that it is dark."""
         locked = self._lock.acquire(timeout=_PATIENCE_S)
         try:
-            if self._closed:
+            if self._closed.is_set():
                 return False
             step = self._schedule.drop()
             if step is not None:
@@ -183,9 +183,9 @@ class HostFlash:
     def run_due(self) -> None:
         """Does what is due by now. The thread's work; in simulated time its caller's."""
         with self._lock:
-            if self._retries and not self._closed and self._clock.now_s() >= self._retry_s:
+            if self._retries and not self._closed.is_set() and self._clock.now_s() >= self._retry_s:
                 self._try_dark()
-            while not self._closed and self._error is None:
+            while not self._closed.is_set() and self._error is None:
                 step = self._schedule.due(self._clock.now_s())
                 if step is None:
                     return
@@ -196,11 +196,11 @@ class HostFlash:
 
     def close(self) -> None:
         """Turns the light off and lets go of the lamp."""
-        if self._closed:
+        if self._closed.is_set():
             return
         self.off()
         with self._lock:
-            self._closed = True
+            self._closed.set()
             self._finalizer.detach()
             with contextlib.suppress(FlashError):  # it is gone: nothing can be put back
                 self._lamp.close()
@@ -218,7 +218,7 @@ class HostFlash:
 
     def _check_train(self, train: PulseTrain) -> None:
         name, can = self._lamp.info.name, self._lamp.capabilities
-        if self._closed:
+        if self._closed.is_set():
             raise FlashError(f"{name} has been closed; open it again.")
         if not can.shortest_on_s <= train.on_s <= can.longest_on_s:
             raise FlashError(
@@ -287,7 +287,7 @@ class HostFlash:
         """Does what is due; how long there is nothing to do, None = the flash is closed."""
         self.run_due()
         with self._lock:
-            if self._closed:
+            if self._closed.is_set():
                 return None
             next_s = self.next_s()
             if next_s is None:
@@ -307,7 +307,13 @@ def _serve(flash: weakref.ref[HostFlash], wake: threading.Event) -> None:
         wake.clear()
 
 
-def _darken(lamp: HostLamp) -> None:
-    with contextlib.suppress(Exception):  # the program ends; there is nobody to tell
-        lamp.switch(False)
-        lamp.close()
+def _darken(lamp: HostLamp, lock: threading.RLock, closed: threading.Event) -> None:
+    closed.set()  # the thread switches nothing any more
+    locked = lock.acquire(timeout=_PATIENCE_S)
+    try:
+        with contextlib.suppress(Exception):  # the program ends; there is nobody to tell
+            lamp.switch(False)
+            lamp.close()
+    finally:
+        if locked:
+            lock.release()

@@ -1,9 +1,9 @@
 """The line to our own firmware over HID: `hid-firmware:`, `hid-firmware:serial=...`.
 
 The byte stream of firmware_protocol in reports of 64 bytes both ways, without report ids. A report holds
-whole frames, one after the other, and zeros to its end: in the stream a zero is a delimiter, and delimiters in
-a row say nothing. A frame has at most 64 bytes with its delimiter, so each fits, and a lost report costs no
-frame but its own. USB's own checksum and repeats are below it.
+whole frames, one after the other, and zeros to its end: in the stream a zero is a delimiter, and delimiters
+in a row say nothing. A frame has at most 64 bytes with its delimiter, so each fits, and a lost report costs
+only the frames that it held. USB's own checksum and repeats are below it.
 
 The device is known by its usage page ff52 and usage 1, and by the product string "relight flash"; it has no
 vendor's number of its own.
@@ -12,6 +12,7 @@ vendor's number of its own.
 from __future__ import annotations
 
 from capture.devices.bench import Bench
+from capture.devices.firmware_flash.flash import open_firmware_flash
 from capture.devices.flash import FlashDevice
 from capture.devices.hid.transport import (
     HidAddress,
@@ -36,8 +37,6 @@ def open_flash(rest: str, bench: Bench) -> FlashDevice:
     Raises:
         FlashError: A setting is not understood, no such device, no permission, or not this firmware.
     """
-    from capture.devices.firmware_flash.flash import open_firmware_flash
-
     options = parse_options(rest, _OPTIONS, FlashError, scheme="hid-firmware")
     address = choose_device(
         find_firmware(),

@@ -15,6 +15,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import re
+import sys
 from typing import Any
 
 from capture.devices.bench import Bench, Clock
@@ -35,7 +36,9 @@ _log = logging.getLogger(__name__)
 VENDOR_ID, PRODUCT_ID = 0x16C0, 0x05DF
 _PRODUCT = re.compile(r"USBRelay([1-8])")
 _CLOSE, _OPEN = 0xFF, 0xFD
-_STATE_REPORT, _REPORT_BYTES, _STATE_BYTES = 1, 9, 8
+_REPORT_BYTES, _STATE_BYTES = 9, 8
+#: The board has no report ids. On Linux usbrelay asks for 1, elsewhere usb-relay-hid asks for 0.
+_STATE_REPORT = 1 if sys.platform == "linux" else 0
 #: Reading the state takes a slow device some milliseconds: not when a switch is due.
 _READ_S = 0.1
 #: No more than so often.

@@ -1,4 +1,4 @@
-"""The relay boards: bytes as usbrelay and usb-relay-hid have them, and what they do on a model of the board."""
+"""The relay boards: bytes as usbrelay and usb-relay-hid have them, and what they do to a model of one."""
 
 import pytest
 from expected_exchange import expected_exchange
