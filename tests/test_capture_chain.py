@@ -1,4 +1,4 @@
-"""The whole chain: the real firmware behind a pseudo-terminal lights a simulated sitter, who is fitted and relit."""
+"""The whole chain: the real firmware lights a simulated sitter, who is recorded, fitted and relit."""
 
 import json
 
@@ -16,7 +16,7 @@ SECONDS = 6
 
 @pytest.fixture(scope="module", params=["simavr", "host"])
 def captured(request, tmp_path_factory):
-    """(session, lamp's edges by CLOCK_MONOTONIC): the ATmega328P's image in simavr, or the same C on the host."""
+    """Session, and the lamp's edges by CLOCK_MONOTONIC: the ATmega328P's image in simavr, or the C on the host."""
     base = tmp_path_factory.getbasetemp()
     programs = (base.parent if base.name.startswith("popen-") else base) / "flash_doubles"
     work = tmp_path_factory.mktemp("chain")
@@ -28,8 +28,10 @@ def captured(request, tmp_path_factory):
     try:
         camera = f"sim:coarse;fps=29.6;edges={work / 'edges'}"
         code = relight_capture(
-            ["--flash", device.path, "--camera", camera, "--duration", str(SECONDS), "--quiet"]
-            + ["--out", str(work / "S")]
+            [
+                *("--flash", device.path, "--camera", camera, "--duration", str(SECONDS)),
+                *("--quiet", "--out", str(work / "S")),
+            ]
         )
         assert code == 0
         lamp = device.lamp()

@@ -1,4 +1,4 @@
-"""A capture shown while it goes on: the monitor's state in the terminal, and in a browser when that is asked."""
+"""A capture shown while it goes on: the monitor's state in the terminal, and in a browser on demand."""
 
 from __future__ import annotations
 
