@@ -1,10 +1,10 @@
-"""Where the firmware is built for the tests of its host."""
+"""What the tests of devices share."""
 
 import pytest
 
 
 @pytest.fixture(scope="session")
 def firmware_directory(tmp_path_factory):
-    """Of all test processes of one run."""
+    """Where the flash firmware is built for the tests of its host; one for all test processes of a run."""
     base = tmp_path_factory.getbasetemp()
     return (base.parent if base.name.startswith("popen-") else base) / "flash_doubles"
