@@ -258,7 +258,7 @@ def _describe(stills: Sequence[_Still], factors: Sequence[float], balance: Seque
         "white_balance_source": f"as shot, {stills[0].path.name}" if first.white_balance else "none known",
         "camera_from_xyz": None if first.camera_from_xyz is None else list(first.camera_from_xyz),
         "cfa": first.cfa or None,
-        "demosaicing": "Malvar 2004" if bayer else "LibRaw" if first.cfa else None,
+        "demosaicing": "LibRaw PPG" if bayer else "LibRaw" if first.cfa else None,
         "black": list(first.black),
         "white": list(first.white),
         "opcodes": list(dict.fromkeys(first.applied)),

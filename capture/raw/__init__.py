@@ -4,6 +4,6 @@
     picture.radiance                 # [H, W, 3] float32, camera RGB, 1.0 = white clip before any gain map
     picture.clipped                  # [H, W] bool
 
-LibRaw (through rawpy) unpacks; levels, DNG gain maps and the demosaicing of Bayer mosaics are ours, because
-LibRaw rounds black levels, leaves gain maps out and cuts at 16 bits.
+LibRaw (through rawpy) unpacks and demosaics; levels and DNG gain maps are ours, because LibRaw rounds black
+levels, leaves gain maps out and would cut what they lift above white.
 """

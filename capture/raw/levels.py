@@ -23,6 +23,7 @@ _BLACK_REPEAT, _BLACK, _BLACK_DELTA_H, _BLACK_DELTA_V, _WHITE = 50713, 50714, 50
 _STRIPS, _TILES = (273, 279), (324, 325)
 _CFA, _LINEAR_RAW = 32803, 34892
 _FLOAT_SAMPLES = 3
+_COMPRESSION, _LOSSY_JPEG = 259, 34892
 _LARGEST_REPEAT = 64
 
 #: Share of the way from black to white from which a sample is clipped: sensors reach full well with some
@@ -122,14 +123,14 @@ def active_area(raw: Directory, shape: tuple[int, ...]) -> tuple[int, int, int, 
 
 
 def dng_levels(raw: Directory, shape: tuple[int, ...]) -> Levels | None:
-    """Levels that a DNG states for a picture [H, W] or [H, W, S]; None for floating-point samples.
+    """Levels that a DNG states for a picture [H, W] or [H, W, S]; None for floating-point or lossy samples.
 
-    Those LibRaw scales to integers by itself, and then knows the levels.
+    Those LibRaw brings to 16 bits by itself, and then knows the levels.
 
     Raises:
         ImageError: levels that cannot be.
     """
-    if raw.number(_SAMPLE_FORMAT, 1) == _FLOAT_SAMPLES or _WHITE not in raw:
+    if raw.number(_SAMPLE_FORMAT, 1) == _FLOAT_SAMPLES or is_lossy(raw) or _WHITE not in raw:
         return None
     samples = shape[2] if len(shape) == 3 else 1
     repeat = [int(n) for n in raw.numbers(_BLACK_REPEAT)[:2]] if _BLACK_REPEAT in raw else [1, 1]
@@ -146,6 +147,11 @@ def dng_levels(raw: Directory, shape: tuple[int, ...]) -> Levels | None:
     levels = Levels(black, rows, columns, white, stated=True)
     _check(levels)
     return levels
+
+
+def is_lossy(raw: Directory) -> bool:
+    """Whether a DNG's samples are JPEGs of 8 bits under a curve, its MapPolynomial, which LibRaw undoes."""
+    return raw.number(_COMPRESSION, 1) == _LOSSY_JPEG
 
 
 def libraw_levels(raw: Any, cell: NDArray[np.uint8], shape: tuple[int, ...]) -> Levels:

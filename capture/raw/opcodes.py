@@ -8,6 +8,7 @@ big-endian whatever the file is.
 from __future__ import annotations
 
 import struct
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Any
 
@@ -151,8 +152,12 @@ class OpcodeList:
         return everywhere * float(max(gains) if disjoint else np.prod(gains))
 
 
-def parse_opcodes(data: bytes) -> OpcodeList:
+def parse_opcodes(data: bytes, done: Collection[str] = ()) -> OpcodeList:
     """The opcodes of an OpcodeList1, 2 or 3.
+
+    Args:
+        data: the list.
+        done: names of opcodes that have been carried out already.
 
     Raises:
         ImageError: malformed; the sentence lacks the file's name.
@@ -177,7 +182,7 @@ def parse_opcodes(data: bytes) -> OpcodeList:
             steps.append(_gain_map(body))
         elif code == _VIGNETTE:
             steps.append(_vignette(body))
-        else:
+        elif _name(code) not in done:
             left_out.append(_name(code))
             missed += [] if flags & _OPTIONAL else [_name(code)]
     return OpcodeList(tuple(steps), tuple(left_out), tuple(missed))

@@ -8,19 +8,16 @@ light-sensitive area.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import rawpy
 from numpy.typing import NDArray
 
 from capture.errors import ImageError
 from capture.raw import facts as said
-from capture.raw.demosaic import binned, demosaic_bayer, is_bayer, touched_by
 from capture.raw.facts import RawFacts
 from capture.raw.levels import (
     Levels,
@@ -28,15 +25,16 @@ from capture.raw.levels import (
     check_whole,
     clipped_samples,
     dng_levels,
+    is_lossy,
     libraw_levels,
     raw_directory,
 )
+from capture.raw.libraw import binned, demosaic, touched_by, unpacked
 from capture.raw.opcodes import OpcodeList, parse_opcodes
 from capture.raw.tiff import Directory, read_directories
 
 _OPCODE_LISTS = (51008, 51009, 51022)  # as read, after linearisation, after demosaicing
 _LARGEST_PIXELS = 1 << 28  # as `capture.images`: what a damaged header may make us allocate
-_XTRANS_MARGIN = 4  # pixels round a clipped sample into which LibRaw's X-Trans interpolation takes it
 _LETTERS = "RGB"
 
 Floats = NDArray[np.float32]
@@ -68,6 +66,7 @@ class RawFile:
         at_clip: which of them are at the white clip, of the same shape.
         cell: [n, n] colour indices of the top left samples, 0 red, 1 green, 2 blue; [1, 1] for a sensor
             without colours.
+        corner: row and column of the first sample in the file's picture.
         after: OpcodeList3.
         facts: what the file says.
     """
@@ -76,6 +75,7 @@ class RawFile:
     samples: Floats
     at_clip: NDArray[np.bool_]
     cell: NDArray[np.uint8]
+    corner: tuple[int, int]
     after: OpcodeList
     facts: RawFacts
 
@@ -97,7 +97,7 @@ class RawFile:
             if directory is not None:
                 check_whole(directory)
             lists = [_opcodes(directory, tag) for tag in _OPCODE_LISTS]
-            with _unpacked(path) as raw:
+            with unpacked(path) as raw:
                 return _linear(path, raw, directories, directory, lists)
         except ImageError as cause:
             raise ImageError(f"{path} cannot be read as RAW: {cause}; copy or export it again.") from cause
@@ -116,11 +116,9 @@ class RawFile:
             radiance, clipped = samples, np.asarray(self.at_clip.any(axis=2))
         elif self.cell.size == 1:
             radiance, clipped = np.repeat(samples[..., None], 3, axis=2), self.at_clip
-        elif is_bayer(self.cell):
-            radiance, clipped = demosaic_bayer(samples, self.cell), touched_by(self.at_clip)
         else:
-            radiance, missing = _by_libraw(self.path, samples)
-            clipped = np.asarray(touched_by(self.at_clip, _XTRANS_MARGIN) | missing)
+            radiance, missing = demosaic(self.path, samples, self.cell, self.corner)
+            clipped = touched_by(self.at_clip, self.cell) | missing
         self.after.apply(radiance)
         return RawPicture(radiance, clipped, self.facts)
 
@@ -148,24 +146,6 @@ def read_raw(path: Path, white_balance: Sequence[float] = (1.0, 1.0, 1.0)) -> Ra
         ImageError: missing, damaged or of a kind that is not read here.
     """
     return RawFile.open(path).develop(white_balance)
-
-
-@contextmanager
-def _unpacked(path: Path) -> Iterator[Any]:
-    """The file open in LibRaw, whose errors become ours."""
-    try:
-        with rawpy.imread(str(path)) as raw:
-            yield raw
-    except (
-        rawpy.LibRawError,
-        rawpy.NotSupportedError,
-        NotImplementedError,
-        RuntimeError,
-        MemoryError,
-    ) as cause:
-        reason = cause.args[0] if cause.args else type(cause).__name__
-        reason = reason.decode("utf-8", "replace") if isinstance(reason, bytes) else str(reason)
-        raise ImageError(f"LibRaw says {' '.join(reason.split()).rstrip('.')!r}") from cause
 
 
 def _linear(
@@ -207,7 +187,7 @@ def _linear(
     at_clip = clipped_samples(stored, samples, levels)
     lists[1].apply(samples)
     facts = _facts(raw, directories, stored.shape, cell, levels, lists)
-    return RawFile(path, samples, at_clip, cell, lists[2], facts)
+    return RawFile(path, samples, at_clip, cell, (top, left), lists[2], facts)
 
 
 def _facts(
@@ -247,7 +227,7 @@ def _facts(
 def _opcodes(directory: Directory | None, tag: int) -> OpcodeList:
     if directory is None or tag not in directory:
         return OpcodeList()
-    return parse_opcodes(directory.value(tag))
+    return parse_opcodes(directory.value(tag), done=("MapPolynomial",) if is_lossy(directory) else ())
 
 
 def _places(raw: Any, top: int, left: int) -> NDArray[np.uint8]:
@@ -279,37 +259,3 @@ def _balanced(samples: Floats, cell: NDArray[np.uint8], balance: Floats) -> Floa
         for row, column in np.ndindex(*cell.shape):
             balanced[row :: len(cell), column :: len(cell)] *= balance[cell[row, column]]
     return balanced
-
-
-def _by_libraw(path: Path, samples: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-    """Colours of another mosaic than Bayer's, by LibRaw: our samples in its buffer, as 16 bits and no more.
-
-    Its range is stretched from the least to the largest sample, so that nothing is cut. Zero is left for what
-    LibRaw does not fill: a colour that is not next to the corner of the picture.
-
-    Returns:
-        [H, W, 3], and [H, W] where a colour is missing.
-    """
-    low, high = float(samples.min()), float(samples.max())
-    scale = 65534.0 / max(high - low, 1e-6)
-    with _unpacked(path) as raw:
-        sizes = raw.sizes
-        if samples.shape != (sizes.height, sizes.width):
-            raise ImageError("its light-sensitive area is not the one that LibRaw interpolates")
-        raw.raw_image_visible[:] = np.round((samples - low) * scale + 1).astype(np.uint16)
-        picture = raw.postprocess(
-            demosaic_algorithm=rawpy.DemosaicAlgorithm.AHD,
-            output_color=rawpy.ColorSpace.raw,
-            output_bps=16,
-            gamma=(1.0, 1.0),
-            user_wb=[1.0, 1.0, 1.0, 1.0],
-            user_black=0,
-            user_cblack=[0, 0, 0, 0],
-            user_sat=65535,
-            user_flip=0,
-            no_auto_bright=True,
-            adjust_maximum_thr=0.0,
-            highlight_mode=rawpy.HighlightMode.Clip,
-        )
-    radiance = (picture.astype(np.float32) - 1) / np.float32(scale) + np.float32(low)
-    return radiance, (picture == 0).any(axis=2)

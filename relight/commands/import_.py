@@ -17,8 +17,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         type=Path,
         metavar="SOURCE",
-        help="videos of one capture, a folder of pictures, a folder or file of posed images (cameras.json), "
-        "a COLMAP model, or a nerfstudio transforms.json",
+        help="videos of one capture, a folder of RAW files or of pictures, a folder or file of posed images "
+        "(cameras.json), a COLMAP model, or a nerfstudio transforms.json",
     )
     parser.add_argument("--out", required=True, type=Path, metavar="SESSION", help="session folder to make")
     parser.add_argument(
