@@ -24,7 +24,7 @@ from capture.devices.opencv_controls import Properties
 from capture.errors import CameraEndedError, CameraError, CameraGoneError, CameraTimeoutError
 
 T = TypeVar("T")
-_HANGING_S = 2.0
+_HANGING_S = 10.0  # V4L2 gives up after as long
 _RETRY_S = 0.05
 _GAP = 1.5  # usual intervals between two stamps from which on a frame is missing
 _KNOWN_AFTER = 5  # intervals, before what is usual is known
