@@ -123,7 +123,7 @@ class HostFlash:
             step = self._schedule.drop()
             if step is not None:
                 self._carry_out(step)
-            self._retries = 0
+                self._retries = 0
             self._lamp.prepare(train.level)
             self._schedule.start(train)
         self._wake.set()
@@ -162,6 +162,7 @@ class HostFlash:
                 self._carry_out(step)
             else:
                 self._lamp.switch(False)
+            self._retries = 0
             return self._lamp.confirm_dark()
         except Exception as error:
             _log.warning("%s was told to go out, but did not take it: %s", self._lamp.info.name, error)
@@ -186,11 +187,16 @@ class HostFlash:
             if self._retries and not self._closed.is_set() and self._clock.now_s() >= self._retry_s:
                 self._try_dark()
             while not self._closed.is_set() and self._error is None:
+                left_out = len(self._schedule.skipped)
                 step = self._schedule.due(self._clock.now_s())
+                if len(self._schedule.skipped) > left_out:
+                    _log.warning("%s: a flash could not begin in time and was left out", self.info.name)
                 if step is None:
                     return
                 try:
                     self._carry_out(step)
+                    if not step.on:
+                        self._check_length()
                 except Exception as error:  # a thread has nobody else to tell
                     self._fail(error)
 
@@ -246,7 +252,9 @@ class HostFlash:
         before_s = self._clock.now_s()
         self._lamp.switch(step.on)
         self._edges.append(self._schedule.done(step, before_s, self._clock.now_s()))
-        if not step.on and self._schedule.last_on_s > LONGEST_ON_S + LATEST_S:
+
+    def _check_length(self) -> None:
+        if self._schedule.last_on_s > LONGEST_ON_S + LATEST_S:
             raise FlashError(
                 f"{self._lamp.info.name} was lit for {self._schedule.last_on_s:.2f} s, and the limit is "
                 f"{LONGEST_ON_S} s: this machine is too busy to switch it in time; end other programs."

@@ -167,7 +167,7 @@ class LitraLamp:
 
     @property
     def capabilities(self) -> FlashCapabilities:
-        """What it can do."""
+        """What it can do; the shortest flash is a guess on the safe side."""
         return FlashCapabilities(own_schedule=False, watchdog=False, shortest_on_s=0.05, dimmable=True)
 
     def prepare(self, level: float) -> None:

@@ -1,8 +1,8 @@
 """Lamps on USB HID as their documents say they behave: reports in, reports out, and whether they shine.
 
-No kernel, no library, no thread: time is what the caller says it is (seconds, any start). They serve as doubles
-in one process (`ModelTransport`) and behind the kernel's uhid. What they do not model: brightness in light,
-latency, the relay's bounce, other programs, and any answer that the documents do not tell.
+No kernel, no library, no thread: time is what the caller says it is (seconds, any start). They serve as
+doubles in one process (`ModelTransport`) and behind the kernel's uhid. What they do not model: brightness in
+light, latency, the relay's bounce, other programs, and any answer that the documents do not tell.
 """
 
 from __future__ import annotations

@@ -1,6 +1,8 @@
 """A lamp that the host switches, as a flash: in virtual time by hand, and once with its thread."""
 
 import gc
+import subprocess
+import sys
 import threading
 import time
 import weakref
@@ -226,6 +228,56 @@ def test_a_lamp_that_nobody_closes_is_dark_when_it_is_forgotten(lamp, clock):
     assert gone() is None
     assert not lamp.on
     assert lamp.closed
+
+
+def test_a_signal_in_the_middle_of_a_call_can_turn_it_off(flash, lamp, clock):
+    flash.start(PulseTrain(start_s=101.0, count=5))
+    run_until(flash, clock, 101.05)
+    confirmed = []
+    lamp.check = lambda idle_s: confirmed.append(flash.off())  # as a signal's handler, with the lock held
+    assert [edge.on for edge in flash.poll()] == [True, False]
+    assert confirmed == [True]
+    assert not lamp.on
+
+
+def test_a_lamp_that_was_lit_for_too_long_is_still_put_out_by_off(flash, lamp, clock):
+    flash.start(PulseTrain(start_s=101.0, count=5))
+    run_until(flash, clock, 101.05)
+    clock.advance_to(103)
+    assert flash.off() is True
+    assert flash.poll()[-1].on is False
+
+
+DIES = """
+import sys, time
+from capture.devices.bench import MonotonicClock
+from capture.devices.flash import FlashCapabilities, FlashInfo, PulseTrain
+from capture.devices.host_flash import HostFlash
+
+class Lamp:
+    info = FlashInfo(url="test:", name="lamp", back_end="test", details={})
+    capabilities = FlashCapabilities(own_schedule=False, watchdog=False, shortest_on_s=0.05)
+    def prepare(self, level): pass
+    def arm(self, on_s): pass
+    def switch(self, on): print("on" if on else "off", flush=True)
+    def check(self, idle_s): pass
+    def report(self): return {}
+    def close(self): print("closed", flush=True)
+
+clock = MonotonicClock()
+flash = HostFlash(Lamp(), clock)
+flash.start(PulseTrain(start_s=clock.now_s() + 0.05, on_s=0.25, period_s=0.5, count=100))
+while not flash.poll():
+    time.sleep(0.01)
+raise SystemExit("the program ends while it is lit")
+"""
+
+
+def test_a_program_that_ends_without_closing_it_leaves_it_dark():
+    ended = subprocess.run([sys.executable, "-c", DIES], capture_output=True, text=True, timeout=60)
+    assert ended.returncode == 1
+    assert ended.stdout.split()[0] == "on"
+    assert ended.stdout.split()[-2:] == ["off", "closed"]
 
 
 def test_the_thread_switches_in_time_and_ends_with_the_flash():
