@@ -55,7 +55,11 @@ def parse(rest: str) -> tuple[Quirks, int]:
     quirks = PROFILES[profile]
     seed = _number("seed", settings.pop("seed", "0"))
     width, height = settings.pop("width", ""), settings.pop("height", "")
-    if width or height:
+    if bool(width) != bool(height):
+        raise CameraError(
+            f"fake-v4l2:{rest} is not understood: width and height go together; give both sides."
+        )
+    if width:
         size = (_even("width", width), _even("height", height))
         quirks = replace(quirks, modes=tuple((name, ((size, _RATES),)) for name, _ in quirks.modes))
     for name, text in settings.items():
@@ -77,5 +81,5 @@ def _number(name: str, text: str) -> int:
 def _even(name: str, text: str) -> int:
     number = _number(name, text)
     if number < 16 or number % 2 or number > 8192:
-        raise CameraError(f"fake-v4l2: {name} is {text}; it must be even, 16..8192, with both sides given.")
+        raise CameraError(f"fake-v4l2: {name} is {text}; it must be even, 16..8192.")
     return number
