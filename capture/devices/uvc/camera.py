@@ -110,6 +110,7 @@ class UvcCamera:
         self._bench = bench
         self._found: dict[str, int] | None = None
         self._locked: dict[str, int] = {}
+        self._verdict: tuple[int, LightCheck] | None = None
 
     @property
     def format(self) -> StreamFormat:
@@ -122,7 +123,7 @@ class UvcCamera:
         Raises:
             CameraError: The stream does not start, or the camera does not answer.
         """
-        first, earlier = self._found is None, dict(self._locked)
+        first = self._found is None
         before = self._readable()
         if self._found is None:
             self._found = before
@@ -135,7 +136,7 @@ class UvcCamera:
                 settle_frames=profile.settle_frames if first else 0,
             )
         )
-        reports = [*self._automatics_off(first)]
+        reports = [*self._automatics_off(first, before)]
         for setting in _SETTINGS:
             reports.extend(self._apply(setting, getattr(profile, setting.field), before, first))
         for name in (*_LEAST, *_DEFAULT):
@@ -144,24 +145,32 @@ class UvcCamera:
                 neutral = limits.minimum if name in _LEAST else limits.default
                 value = float(before.get(name, 0) if neutral is None else neutral)
                 reports.append(self._set(name, name, value, float, first, requested=value))
+        now = self._readable()
         for name in _RECORDED:
-            if name in before:
-                self._locked[name] = value = self._controls.get(name)
-                reports.append(ControlReport(name=name, requested=None, read_back=float(value)))
-        warnings = [*streamed.warnings, *self._warnings(reports)]
+            if name in now:
+                self._locked[name] = now[name]
+                reports.append(ControlReport(name=name, requested=None, read_back=float(now[name])))
+        warnings = [*streamed.warnings, *self._warnings(reports, now)]
         exposure = self._locked.get(_EXPOSURE)
-        if exposure is not None and (first or exposure != earlier.get(_EXPOSURE)):
-            warnings += self._check_light(reports, exposure)
+        if exposure is not None:
+            if first or self._verdict is None or self._verdict[0] != exposure:
+                self._verdict = (exposure, self._verified(exposure))
+            warnings += self._with_light(reports, self._verdict[1])
         fps = [report for report in streamed.controls if report.name == "fps"]
         return LockReport(controls=(*fps, *reports), warnings=tuple(warnings))
 
-    def _check_light(self, reports: list[ControlReport], exposure: int) -> list[str]:
-        """Puts the light's verdict into the report of the exposure, after a second try; gives warnings."""
+    def _verified(self, exposure: int) -> LightCheck:
+        """What the light says; a failure has a second try."""
         check = self._ask_light(exposure)
-        if check.verified is False and self._locked.get(_AE_MODE) is not None:
+        if check.verified is False and _AE_MODE in self._locked:
             self._force_manual(self._locked[_AE_MODE])
-            self._controls.set(_EXPOSURE, exposure)
+            with suppress(StalledError):
+                self._controls.set(_EXPOSURE, exposure)
             check = self._ask_light(exposure)
+        return check
+
+    def _with_light(self, reports: list[ControlReport], check: LightCheck) -> list[str]:
+        """Puts the light's verdict into the report of the exposure; gives warnings."""
         index = next(index for index, report in enumerate(reports) if report.name == "exposure_s")
         notes = [note for note in (reports[index].note, check.note) if note]
         reports[index] = replace(reports[index], verified=check.verified, note="; ".join(notes))
@@ -175,7 +184,8 @@ class UvcCamera:
 
     def _ask_light(self, exposure: int) -> LightCheck:
         def set_exposure(exposure_s: float) -> float:
-            self._controls.set(_EXPOSURE, self._controls.limits(_EXPOSURE).nearest(exposure_s / _UNIT_S))
+            with suppress(StalledError):  # then it keeps what it has, which the read-back says
+                self._controls.set(_EXPOSURE, self._controls.limits(_EXPOSURE).nearest(exposure_s / _UNIT_S))
             return _seconds(self._controls.get(_EXPOSURE))
 
         def read() -> CapturedFrame:
@@ -194,12 +204,12 @@ class UvcCamera:
                 continue  # one that can only be set, or not be read while an automatic has it
         return values
 
-    def _automatics_off(self, first: bool) -> list[ControlReport]:
+    def _automatics_off(self, first: bool, before: dict[str, int]) -> list[ControlReport]:
         reports = []
         if _AE_MODE in self._controls:
             modes = self._controls.modes(_AE_MODE)
             wanted = _SHUTTER_PRIORITY if modes & _SHUTTER_PRIORITY and not modes & _MANUAL else _MANUAL
-            if first and self._controls.get(_AE_MODE) == wanted:
+            if first and before.get(_AE_MODE) == wanted:
                 self._force_manual(wanted)
             reports.append(self._set(_AE_MODE, _AE_MODE, wanted, float, first, requested=float(wanted)))
         for name in _AUTOMATICS:
@@ -276,8 +286,10 @@ class UvcCamera:
                 with suppress(StalledError):
                     self._controls.set(_AE_MODE, mode)
 
-    def _warnings(self, reports: list[ControlReport]) -> list[str]:
+    def _warnings(self, reports: list[ControlReport], now: dict[str, int]) -> list[str]:
         warnings = [f"{report.name}: {report.note}." for report in reports if report.note]
+        if now.get("privacy"):
+            warnings.append(f"The shutter of the {self._link.device} is shut; open it.")
         if _EXPOSURE not in self._controls:
             warnings.append(
                 f"The {self._link.device} announces no exposure time over USB; light the room evenly and "

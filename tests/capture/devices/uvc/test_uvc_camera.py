@@ -20,6 +20,7 @@ from capture.devices import uvc
 from capture.devices.bench import Bench, VirtualClock
 from capture.devices.camera import CameraDevice, CameraProfile
 from capture.devices.uvc.camera import UvcCamera
+from capture.devices.uvc.requests import Limits
 from capture.errors import CameraError, CameraGoneError
 
 CT, PU = CAMERA_TERMINAL, PROCESSING_UNIT
@@ -72,7 +73,8 @@ def test_the_light_confirms_the_exposure(opened: UvcCamera, camera: FakeCamera) 
     assert next(control for control in report.controls if control.name == "exposure_s").verified
     assert camera.cur(CT, 0x04) == 50
     camera.writes.clear()
-    opened.lock(PROFILE)
+    again = opened.lock(PROFILE)
+    assert next(control for control in again.controls if control.name == "exposure_s").verified
     assert camera.writes == [], "an exposure that is verified and stays is not tried again"
 
 
@@ -140,8 +142,7 @@ def test_a_camera_that_clamps_by_itself_is_found_out_by_the_read_back(
     opened: UvcCamera, camera: FakeCamera
 ) -> None:
     camera.controls[PU, 0x04] = FakeControl(2, 64, 0, 15, clamps=True)
-    camera.controls[PU, 0x04].high = 15
-    opened._controls._limits["gain"] = type(opened._controls.limits("gain"))(0, 255, 1, 0)  # it said 255
+    opened._controls._limits["gain"] = Limits(0, 255, 1, 0)  # it said 255
     report = opened.lock(CameraProfile(gain=200, settle_frames=0))
     gain = next(control for control in report.controls if control.name == "gain")
     assert (gain.read_back, gain.note) == (15, "set to 200, but the camera says 15")
@@ -193,6 +194,24 @@ def test_a_refusal_is_reported_with_the_cameras_own_reason(opened: UvcCamera, ca
     assert gain.read_back is None
     assert "an automatic has it" in gain.note
     assert "not in its present state" in gain.note
+
+
+def test_an_exposure_that_is_refused_while_the_light_is_asked_is_no_failure(
+    opened: UvcCamera, camera: FakeCamera
+) -> None:
+    camera.controls[CT, 0x04].low = 40  # though it said 3: the half of 5 ms is refused
+    opened._controls._limits["exposure_time_absolute"] = Limits(3, 2047, 1, 250)
+    report = opened.lock(PROFILE)
+    exposure = next(control for control in report.controls if control.name == "exposure_s")
+    assert (exposure.read_back, camera.cur(CT, 0x04)) == (0.005, 50)
+    assert exposure.verified  # from 10 ms to 5
+
+
+def test_a_shut_shutter_is_said(camera: FakeCamera, monkeypatch: pytest.MonkeyPatch) -> None:
+    camera.specific = video_control(camera_controls=0x060A2E)
+    camera.controls[CT, 0x11] = FakeControl(1, 1)
+    report = open_fake(camera, monkeypatch).lock(PROFILE)
+    assert "The shutter of the USB camera 046d:082d is shut; open it." in report.warnings
 
 
 def test_check_finds_what_another_program_changed(opened: UvcCamera, camera: FakeCamera) -> None:
