@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import logging
 import threading
+import weakref
 from collections import deque
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -24,7 +25,7 @@ from capture.devices.firmware_flash.link import FirmwareLink
 from capture.devices.firmware_flash.transport import ByteTransport
 from capture.devices.flash import LONGEST_ON_S, FlashCapabilities, FlashEdge, FlashInfo, PulseTrain
 from capture.errors import FlashError, FlashGoneError
-from firmware_protocol import Stat, Stop, Train
+from firmware_protocol import Stat, Stop, Train, encode
 from firmware_protocol.limits import FULL_LEVEL, MAX_ON_MS, MIN_PERIOD_US
 from firmware_protocol.messages import Capability, State
 
@@ -92,6 +93,8 @@ class FirmwareFlash:
         self._log = EdgeLog()
         self._failure: FlashError | None = None
         self._needs_hello = True
+        # Dark too when nobody closes it: at the end of the program, or when it is forgotten.
+        self._finalizer = weakref.finalize(self, _abandon, transport)
 
     def shake_hands(self) -> None:
         """Finds the device, dark, and begins to tend it.
@@ -104,7 +107,8 @@ class FirmwareFlash:
             self._link.ask(Stop())  # a train of a host before us
             self._needs_hello = False
         if isinstance(self._clock, MonotonicClock) and self._thread is None:
-            self._thread = threading.Thread(target=self._tend, name=f"flash {self._url}", daemon=True)
+            wanted = (weakref.ref(self), self._closing)
+            self._thread = threading.Thread(target=_serve, args=wanted, name=self._url, daemon=True)
             self._thread.start()
 
     @property
@@ -204,12 +208,15 @@ class FirmwareFlash:
         """Off, and the line is let go of."""
         if self._closed:
             return
-        self.off()
-        self._closed = True
-        self._closing.set()
-        if self._thread is not None and self._thread is not threading.current_thread():
-            self._thread.join(_LOCK_S)  # it is at most in a read of 20 ms or a write of 500 ms
-        self._transport.close()
+        try:
+            self.off()
+        finally:
+            self._closed = True
+            self._closing.set()
+            self._finalizer.detach()
+            if self._thread is not None and self._thread is not threading.current_thread():
+                self._thread.join(_LOCK_S)  # it is at most in a read of 20 ms or a write of 500 ms
+            self._transport.close()
 
     def __enter__(self) -> Self:
         """Itself."""
@@ -237,15 +244,14 @@ class FirmwareFlash:
         finally:
             self._lock.release()
 
-    def _tend(self) -> None:
-        while not self._closing.is_set():
-            if self._callers:
-                self._closing.wait(0.001)
-                continue
-            with self._lock:
-                self._tend_once(_TEND_S)
-            if isinstance(self._failure, FlashGoneError):
-                return
+    def _take_turn(self) -> bool:
+        """One round of the thread; whether there is to be another."""
+        if self._callers:
+            self._closing.wait(0.001)
+            return True
+        with self._lock:
+            self._tend_once(_TEND_S)
+        return not isinstance(self._failure, FlashGoneError)
 
     def _tend_once(self, timeout_s: float) -> None:
         """Reads what is there; nothing is raised, all is kept for the next call."""
@@ -342,3 +348,21 @@ def _rate(clock: DeviceClock) -> float:
     """
     drift_ppm, sigma_ppm = clock.fit.drift_ppm, clock.fit.drift_sigma_ppm
     return 1 + drift_ppm * 1e-6 if abs(drift_ppm) > 3 * sigma_ppm else 1.0
+
+
+def _serve(flash: weakref.ref[FirmwareFlash], closing: threading.Event) -> None:
+    """The thread. Holds no reference between its rounds, so that a forgotten flash ends it."""
+    while not closing.is_set():
+        strong = flash()
+        if strong is None or not strong._take_turn():
+            return
+        del strong
+
+
+def _abandon(transport: ByteTransport) -> None:
+    """A last word to a device whose flash nobody has closed."""
+    try:
+        transport.write(b"\0" + encode(Stop(), 0xFFFF))
+    except FlashError as error:
+        log.warning("%s", error)
+    transport.close()

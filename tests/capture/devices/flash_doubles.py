@@ -147,7 +147,10 @@ class SteppedProgram:
         self.now_us = 0
 
     def reset(self):
-        self._process.stdin.write("reset\n")
+        self.command("reset")
+
+    def command(self, text):
+        self._process.stdin.write(text + "\n")
 
     def advance(self, us):
         self.now_us += us

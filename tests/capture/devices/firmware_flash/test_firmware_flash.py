@@ -252,3 +252,46 @@ def test_events_that_are_lost_are_noticed(rig):
         edges += rig.watch(flash, 1.2)
         assert [edge.pulse for edge in edges] == [0, 0, 2, 2, 3, 3]
         assert flash.link_report()["edges_missing"] == 2
+
+
+def test_a_train_on_the_chip_has_its_period_and_width_to_the_cycle_while_the_host_talks(chip):
+    """In cycles of the simulated ATmega328P: an instruction of four is how late simavr may see a match."""
+    rig = SteppedRig(StepLine(chip, step_us=1000))
+    with rig.open() as flash:
+        train = PulseTrain(start_s=rig.clock.now_s() + 0.3, period_s=0.5, on_s=0.1, count=6)
+        flash.start(train)
+        assert len(rig.watch(flash, 3.2)) == 12
+    edges = chip.edges
+    for k in range(6):
+        assert edges[2 * k][0] - edges[0][0] == pytest.approx(0.5 * k, abs=4 / 16e6)
+        assert edges[2 * k + 1][0] - edges[2 * k][0] == pytest.approx(0.1, abs=4 / 16e6)
+    # And the first is where the host wanted it, as well as it knew the chip's clock through 1 ms steps.
+    assert rig.lamp()[0][0] == pytest.approx(train.start_s, abs=2e-3)
+
+
+def test_a_chip_that_hangs_while_lit_goes_dark_and_is_said_to_have_restarted(chip):
+    rig = SteppedRig(StepLine(chip, step_us=1000))
+    with rig.open() as flash:
+        lit_soon(rig, flash)
+        chip.command("hang")
+        poll_until_it_raises(rig, flash, FlashResetError, 1.5)
+        on_s, off_s = (t for t, _ in rig.lamp())
+        assert off_s - on_s < 0.25
+
+
+def test_off_within_a_command_is_answered_and_confuses_nothing(core):
+    """As the handler of an interrupt calls it."""
+    rig = SteppedRig(StepLine(core))
+    with rig.open() as flash:
+        read, confirmed = rig.line.read, []
+
+        def interrupted(timeout_s):
+            if not confirmed:
+                confirmed.append(None)
+                confirmed[0] = flash.off()
+            return read(timeout_s)
+
+        rig.line.read = interrupted
+        flash.start(PulseTrain(start_s=rig.clock.now_s() + 0.2, count=1))
+        assert confirmed == [True]
+        rig.watch(flash, 0.5)

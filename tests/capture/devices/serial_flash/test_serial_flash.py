@@ -163,6 +163,20 @@ def test_a_device_that_is_pulled_out_is_gone_at_the_next_poll(firmware_directory
     device.process.stdout.close()
 
 
+def test_a_flash_that_is_forgotten_stops(double):
+    rig = LiveRig(double.path, double)
+    flash = open_flash(double.path, Bench())
+    flash.start(PulseTrain(start_s=rig.clock.now_s() + 0.3, period_s=0.34, on_s=0.1, count=1000))
+    while not flash.poll():
+        rig.sleep(0.01)
+    del flash
+    rig.sleep(0.25)
+    before = len(rig.lamp())
+    rig.sleep(0.7)  # two flashes more would have come, and the watchdog not yet
+    assert len(rig.lamp()) == before
+    assert not rig.lamp()[-1][1]
+
+
 HOST = """
 import sys
 from capture.devices.bench import Bench
