@@ -28,7 +28,7 @@ from capture.errors import CameraError
 _log = logging.getLogger(__name__)
 
 #: The first frame of a stream takes a webcam up to two seconds; the others come at their rate.
-_FIRST_FRAME_S, _FRAME_S = 5.0, 2.0
+_FIRST_FRAME_S, _FRAME_S = 5.0, 5.0
 #: Modes that are given up one after the other while the bus has no bandwidth for them.
 _BANDWIDTH_TRIES = 4
 

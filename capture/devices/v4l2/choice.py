@@ -50,8 +50,9 @@ def choose_mode(modes: Iterable[Mode], profile: CameraProfile, path: str) -> Cho
     for fitting in (moderate, useful):
         for kind in (_is_uncompressed, _is_jpeg, _is_other):
             if among := [mode for mode in fitting if kind(mode)]:
-                pick = max if fitting is moderate else min  # beyond the limit: the least beyond
-                return _choice(pick(among, key=_pixels), profile)
+                # Uncompressed frames are compressed by us, without loss, at a cost that grows with them.
+                largest = kind is _is_jpeg and fitting is moderate
+                return _choice((max if largest else min)(among, key=_pixels), profile)
     fast = [mode for mode in usable if _fast(mode, wished)]
     if fast:
         return _choice(max(fast, key=lambda mode: (_pixels(mode), _is_uncompressed(mode))), profile)

@@ -27,6 +27,7 @@ def choose(modes, **profile):
 
 def test_uncompressed_is_taken_where_it_is_fast_enough_at_a_useful_size():
     assert choose(USB3) == (("NV12", 1920, 1080, 30.0), ())
+    assert choose((*USB3, Mode("YUYV", 1280, 720, (30.0,))))[0] == ("YUYV", 1280, 720, 30.0)
 
 
 def test_motion_jpeg_is_taken_where_uncompressed_is_slow():
