@@ -27,6 +27,7 @@ from capture.devices.bench import Bench
 from capture.devices.camera import CameraDevice, CameraInfo
 from capture.devices.url_options import parse_options
 from capture.devices.uvc.camera import UvcCamera
+from capture.devices.uvc.control_lock import ControlLock
 from capture.devices.uvc.descriptors import VideoControl, parse_video_control
 from capture.devices.uvc.requests import UvcControls
 from capture.devices.uvc.usb_link import UsbBackend, UsbCamera, UsbLink, find_cameras, libusb
@@ -68,7 +69,9 @@ def open_uvc(rest: str, bench: Bench, backend: UsbBackend, platform: str = sys.p
     except BaseException:
         link.close()
         raise
-    return UvcCamera(_info(url, link, interface, controls, stream), link, controls, stream, bench)
+    return UvcCamera(
+        _info(url, link, interface, controls, stream), link, ControlLock(controls, bench), stream
+    )
 
 
 def list_cameras() -> tuple[str, ...]:

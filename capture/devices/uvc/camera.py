@@ -1,21 +1,15 @@
 """A camera of two halves: its controls by USB requests, its pictures through another back end.
 
-Order of a lock (each step is there because some camera needs it): what the automatics have found is read; the
-stream starts and some frames are dropped, because firmware forgets its controls at a start; automatics off,
-exposure by way of another mode, because a camera can have lost the mode that it says it has; only then the
-values, because they are refused while an automatic is on; everything is read back; last the light is asked,
-which also shows that the stream is this camera's.
+The stream is locked first, with the format alone; then the controls (`control_lock`); last the light is asked
+whether the exposure is what it says, which also shows that the stream is this very camera's.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from types import TracebackType
 from typing import Self
 
-from capture.devices.bench import Bench
 from capture.devices.camera import (
     CameraDevice,
     CameraInfo,
@@ -26,91 +20,22 @@ from capture.devices.camera import (
     StreamFormat,
 )
 from capture.devices.light_check import LightCheck, skip_latency, verify_exposure
-from capture.devices.uvc.requests import UvcControls
-from capture.devices.uvc.usb_link import StalledError, UsbLink
-from capture.errors import CameraError, CameraGoneError
+from capture.devices.uvc.control_lock import ControlLock
+from capture.devices.uvc.usb_link import UsbLink
 
-_EXPOSURE, _AE_MODE = "exposure_time_absolute", "auto_exposure_mode"
-_UNIT_S = 1e-4  # of the exposure time
 _FRAME_TIMEOUT_S = 2.0
-_MANUAL, _AUTO, _SHUTTER_PRIORITY, _APERTURE_PRIORITY = 1, 2, 4, 8
-_AUTOMATICS = (
-    "auto_exposure_priority",
-    "white_balance_temperature_auto",
-    "white_balance_component_auto",
-    "focus_auto",
-    "hue_auto",
-    "contrast_auto",
-)
-#: Control -> the automatic that sets it, and the values of that in which it does.
-_GOVERNED = {
-    _EXPOSURE: (_AE_MODE, (_AUTO, _APERTURE_PRIORITY)),
-    "iris_absolute": (_AE_MODE, (_AUTO, _SHUTTER_PRIORITY)),
-    "white_balance_temperature": ("white_balance_temperature_auto", (1,)),
-    "white_balance_blue": ("white_balance_component_auto", (1,)),
-    "white_balance_red": ("white_balance_component_auto", (1,)),
-    "focus_absolute": ("focus_auto", (1,)),
-    "hue": ("hue_auto", (1,)),
-    "contrast": ("contrast_auto", (1,)),
-}
-_LEAST = ("backlight_compensation", "sharpness")  # set to their least value
-_DEFAULT = ("brightness", "contrast", "saturation", "hue", "gamma")  # whatever was there before us
-_RECORDED = (
-    "white_balance_blue",
-    "white_balance_red",
-    "digital_multiplier",
-    "iris_absolute",
-    "zoom_absolute",
-    "pan_absolute",
-    "tilt_absolute",
-    "roll_absolute",
-)
-_HZ_OF_POWER_LINE: dict[int, float] = {0: 0.0, 1: 50.0, 2: 60.0}
-_POWER_LINE_OF_HZ: dict[float, float] = {0: 0.0, 50: 1.0, 60: 2.0}
-_SETTLING_S = 0.5  # a lens that moves (GET_INFO: asynchronous) answers with where it is
-_SETTLING_STEP_S = 0.05
-
-
-@dataclass(frozen=True)
-class _Setting:
-    """A field of the profile and the control that it goes to, with the conversion both ways."""
-
-    field: str
-    control: str
-    to_device: Callable[[float], float] = float
-    from_device: Callable[[int], float | None] = float
-
-
-def _seconds(units: float) -> float:
-    return round(units * _UNIT_S, 7)
-
-
-_SETTINGS = (
-    _Setting(
-        "exposure_s", _EXPOSURE, lambda seconds: seconds / _UNIT_S, lambda units: round(units * _UNIT_S, 7)
-    ),
-    _Setting("gain", "gain"),
-    _Setting("white_balance_k", "white_balance_temperature"),
-    _Setting("focus", "focus_absolute"),
-    _Setting("mains_hz", "power_line_frequency", _POWER_LINE_OF_HZ.__getitem__, _HZ_OF_POWER_LINE.get),
-)
 
 
 class UvcCamera:
     """Controls over USB beside a stream of another back end; `open_camera` puts them together."""
 
-    def __init__(
-        self, info: CameraInfo, link: UsbLink, controls: UvcControls, stream: CameraDevice, bench: Bench
-    ) -> None:
+    def __init__(self, info: CameraInfo, link: UsbLink, controls: ControlLock, stream: CameraDevice) -> None:
         """Takes over the link and the stream, and closes them."""
         self.info = info
         self._link = link
         self._controls = controls
         self._stream = stream
-        self._bench = bench
-        self._found: dict[str, int] | None = None
-        self._locked: dict[str, int] = {}
-        self._verdict: tuple[int, LightCheck] | None = None
+        self._verdict: tuple[float, LightCheck] | None = None
 
     @property
     def format(self) -> StreamFormat:
@@ -123,50 +48,58 @@ class UvcCamera:
         Raises:
             CameraError: The stream does not start, or the camera does not answer.
         """
-        first = self._found is None
-        before = self._readable()
-        if self._found is None:
-            self._found = before
+        fresh = self._controls.begin()
         streamed = self._stream.lock(
             CameraProfile(
                 width=profile.width,
                 height=profile.height,
                 fps=profile.fps,
                 pixel_format=profile.pixel_format,
-                settle_frames=profile.settle_frames if first else 0,
+                settle_frames=profile.settle_frames if fresh else 0,
             )
         )
-        reports = [*self._automatics_off(first, before)]
-        for setting in _SETTINGS:
-            reports.extend(self._apply(setting, getattr(profile, setting.field), before, first))
-        for name in (*_LEAST, *_DEFAULT):
-            if name in self._controls:
-                limits = self._controls.limits(name)
-                neutral = limits.minimum if name in _LEAST else limits.default
-                value = float(before.get(name, 0) if neutral is None else neutral)
-                reports.append(self._set(name, name, value, float, first, requested=value))
-        now = self._readable()
-        for name in _RECORDED:
-            if name in now:
-                self._locked[name] = now[name]
-                reports.append(ControlReport(name=name, requested=None, read_back=float(now[name])))
-        warnings = [*streamed.warnings, *self._warnings(reports, now)]
-        exposure = self._locked.get(_EXPOSURE)
-        if exposure is not None:
-            if first or self._verdict is None or self._verdict[0] != exposure:
-                self._verdict = (exposure, self._verified(exposure))
+        reports = self._controls.lock(profile, fresh)
+        warnings = [*streamed.warnings, *self._warnings(reports)]
+        exposure_s = self._controls.exposure_s
+        if exposure_s is not None:
+            if fresh or self._verdict is None or self._verdict[0] != exposure_s:
+                self._verdict = (exposure_s, self._verified(exposure_s))
             warnings += self._with_light(reports, self._verdict[1])
         fps = [report for report in streamed.controls if report.name == "fps"]
         return LockReport(controls=(*fps, *reports), warnings=tuple(warnings))
 
-    def _verified(self, exposure: int) -> LightCheck:
+    def _warnings(self, reports: list[ControlReport]) -> list[str]:
+        warnings = [f"{report.name}: {report.note}." for report in reports if report.note]
+        if self._controls.shut:
+            warnings.append(f"The shutter of the {self._link.device} is shut; open it.")
+        exposure_s, fps = self._controls.exposure_s, self._stream.format.fps
+        if exposure_s is None:
+            warnings.append(
+                f"The {self._link.device} has no exposure time that can be set over USB; light the room "
+                "evenly and check that its pictures do not change by themselves, or use another camera."
+            )
+        elif fps and exposure_s * fps > 1:
+            warnings.append(
+                f"An exposure of {exposure_s:g} s is longer than the {1 / fps:.4g} s from frame to frame at "
+                f"{fps:g} fps; the camera will cut it or slow down."
+            )
+        return warnings
+
+    def _verified(self, exposure_s: float) -> LightCheck:
         """What the light says; a failure has a second try."""
-        check = self._ask_light(exposure)
-        if check.verified is False and _AE_MODE in self._locked:
-            self._force_manual(self._locked[_AE_MODE])
-            with suppress(StalledError):
-                self._controls.set(_EXPOSURE, exposure)
-            check = self._ask_light(exposure)
+        check = self._ask_light(exposure_s)
+        if check.verified is False:
+            self._controls.force_manual()
+            self._controls.set_exposure(exposure_s)
+            check = self._ask_light(exposure_s)
+        return check
+
+    def _ask_light(self, exposure_s: float) -> LightCheck:
+        def read() -> CapturedFrame:
+            return self._stream.read(_FRAME_TIMEOUT_S)
+
+        check = verify_exposure(read, lambda: self.format, self._controls.set_exposure, exposure_s)
+        skip_latency(read)
         return check
 
     def _with_light(self, reports: list[ControlReport], check: LightCheck) -> list[str]:
@@ -182,180 +115,17 @@ class UvcCamera:
             doubt = f"; see that {source} is this very camera (stream=...) and no other program sets it"
         return [f"exposure_s: {check.note}{doubt}."]
 
-    def _ask_light(self, exposure: int) -> LightCheck:
-        def set_exposure(exposure_s: float) -> float:
-            with suppress(StalledError):  # then it keeps what it has, which the read-back says
-                self._controls.set(_EXPOSURE, self._controls.limits(_EXPOSURE).nearest(exposure_s / _UNIT_S))
-            return _seconds(self._controls.get(_EXPOSURE))
-
-        def read() -> CapturedFrame:
-            return self._stream.read(_FRAME_TIMEOUT_S)
-
-        check = verify_exposure(read, lambda: self._stream.format, set_exposure, _seconds(exposure))
-        skip_latency(read)
-        return check
-
-    def _readable(self) -> dict[str, int]:
-        values = {}
-        for name in self._controls.names:
-            try:
-                values[name] = self._controls.get(name)
-            except StalledError:
-                continue  # one that can only be set, or not be read while an automatic has it
-        return values
-
-    def _automatics_off(self, first: bool, before: dict[str, int]) -> list[ControlReport]:
-        reports = []
-        if _AE_MODE in self._controls:
-            modes = self._controls.modes(_AE_MODE)
-            wanted = _SHUTTER_PRIORITY if modes & _SHUTTER_PRIORITY and not modes & _MANUAL else _MANUAL
-            if first and before.get(_AE_MODE) == wanted:
-                self._force_manual(wanted)
-            reports.append(self._set(_AE_MODE, _AE_MODE, wanted, float, first, requested=float(wanted)))
-        for name in _AUTOMATICS:
-            if name in self._controls:
-                reports.append(self._set(name, name, 0.0, float, first, requested=0.0))
-        return reports
-
-    def _apply(
-        self, setting: _Setting, asked: float | None, before: dict[str, int], first: bool
-    ) -> list[ControlReport]:
-        """Sets one field of the profile; without a wish, what the automatic had found stays."""
-        name = setting.control
-        if name not in self._controls:
-            if asked is None:
-                return []
-            note = "the camera has no such control"
-            return [ControlReport(name=setting.field, requested=asked, read_back=None, note=note)]
-        if asked is not None:
-            value = setting.to_device(asked)
-        elif name == "power_line_frequency" and before.get(name) not in _HZ_OF_POWER_LINE:
-            value = 0.0  # it looks for the mains by itself, an automatic too
-        elif name in before:
-            value = float(before[name])
-        else:
-            value = float(self._controls.limits(name).default or 0)
-        return [self._set(setting.field, name, value, setting.from_device, first, requested=asked)]
-
-    def _set(
-        self,
-        report_name: str,
-        name: str,
-        value: float,
-        from_device: Callable[[int], float | None],
-        always: bool,
-        requested: float | None,
-    ) -> ControlReport:
-        """Sets a control to the nearest value that the camera takes, reads it back, says how that went."""
-        limits = self._controls.limits(name)
-        chosen = limits.nearest(value)
-        notes = []
-        if requested is not None and abs(chosen - value) > 0.5:
-            notes.append(f"asked for {value:.6g} in the camera's units, which takes {limits}")
-        try:
-            if always or self._controls.get(name) != chosen:
-                if self._controls.state(name).disabled_by_auto:
-                    notes.append("the camera says that an automatic has it")
-                self._controls.set(name, chosen)
-            read = self._read_back(name, chosen)
-        except StalledError as error:
-            notes.append(str(error).rstrip("."))
-            return ControlReport(name=report_name, requested=requested, read_back=None, note="; ".join(notes))
-        if read != chosen:
-            notes.append(f"set to {chosen}, but the camera says {read}")
-        self._locked[name] = read
-        return ControlReport(
-            name=report_name, requested=requested, read_back=from_device(read), note="; ".join(notes)
-        )
-
-    def _read_back(self, name: str, chosen: int) -> int:
-        read = self._controls.get(name)
-        waited_s = 0.0
-        while read != chosen and waited_s < _SETTLING_S and self._controls.state(name).asynchronous:
-            self._bench.clock.sleep(_SETTLING_STEP_S)
-            waited_s += _SETTLING_STEP_S
-            read = self._controls.get(name)
-        return read
-
-    def _force_manual(self, manual: int) -> None:
-        """Manual mode by way of another: a camera can have lost the mode that it says it has."""
-        modes = self._controls.modes(_AE_MODE)
-        detour = next((mode for mode in (_APERTURE_PRIORITY, _AUTO) if modes & mode), None)
-        for mode in (detour, manual):
-            if mode is not None:
-                with suppress(StalledError):
-                    self._controls.set(_AE_MODE, mode)
-
-    def _warnings(self, reports: list[ControlReport], now: dict[str, int]) -> list[str]:
-        warnings = [f"{report.name}: {report.note}." for report in reports if report.note]
-        if now.get("privacy"):
-            warnings.append(f"The shutter of the {self._link.device} is shut; open it.")
-        if _EXPOSURE not in self._controls:
-            warnings.append(
-                f"The {self._link.device} announces no exposure time over USB; light the room evenly and "
-                "check that its pictures do not change by themselves, or use another camera."
-            )
-        exposure_s = _seconds(self._locked.get(_EXPOSURE, 0))
-        fps = self._stream.format.fps
-        if fps and exposure_s * fps > 1:
-            warnings.append(
-                f"An exposure of {exposure_s:g} s is longer than the {1 / fps:.4g} s from frame to frame at "
-                f"{fps:g} fps; the camera will cut it or slow down."
-            )
-        return warnings
-
     def read(self, timeout_s: float) -> CapturedFrame:
         """The next frame of the stream."""
         return self._stream.read(timeout_s)
 
     def check(self) -> tuple[ControlReport, ...]:
-        """Reads every locked control again: other programs and the firmware change them."""
-        changed = []
-        names = {setting.control: setting for setting in _SETTINGS}
-        for name, locked in self._locked.items():
-            setting = names.get(name, _Setting(name, name))
-            try:
-                read = self._controls.get(name)
-            except StalledError as error:
-                changed.append(
-                    ControlReport(
-                        name=setting.field,
-                        requested=setting.from_device(locked),
-                        read_back=None,
-                        note=str(error).rstrip("."),
-                    )
-                )
-                continue
-            if read != locked:
-                changed.append(
-                    ControlReport(
-                        name=setting.field,
-                        requested=setting.from_device(locked),
-                        read_back=setting.from_device(read),
-                        verified=False,
-                        note=f"was {locked} after the lock and is {read} now",
-                    )
-                )
-        return (*changed, *self._stream.check())
+        """What other programs or the firmware have changed since the lock."""
+        return (*self._controls.check(), *self._stream.check())
 
     def restore(self) -> tuple[str, ...]:
-        """Puts back what `lock` found: the values first, because they are refused once an automatic is on."""
-        found, self._found = self._found, None
-        self._locked = {}
-        problems = list(self._stream.restore())
-        if found is None:
-            return tuple(problems)
-        automatics = (_AE_MODE, *_AUTOMATICS)
-        values = [name for name in found if name not in automatics and not _was_governed(name, found)]
-        for name in (*values, *(name for name in automatics if name in found)):
-            try:
-                if self._controls.get(name) != found[name]:
-                    self._controls.set(name, found[name])
-            except CameraGoneError as error:
-                return (*problems, f"The controls could not be put back: {error}")
-            except CameraError as error:
-                problems.append(f"{name} could not be put back to {found[name]}: {error}")
-        return tuple(problems)
+        """Puts back what `lock` found."""
+        return (*self._stream.restore(), *self._controls.restore())
 
     def close(self) -> None:
         """Stops the stream and lets go of both halves."""
@@ -373,9 +143,3 @@ class UvcCamera:
     ) -> None:
         """Closes it."""
         self.close()
-
-
-def _was_governed(name: str, found: dict[str, int]) -> bool:
-    """Whether an automatic was setting a control when it was found, so that its value means nothing."""
-    automatic, values = _GOVERNED.get(name, ("", ()))
-    return found.get(automatic) in values

@@ -142,7 +142,7 @@ def test_a_camera_that_clamps_by_itself_is_found_out_by_the_read_back(
     opened: UvcCamera, camera: FakeCamera
 ) -> None:
     camera.controls[PU, 0x04] = FakeControl(2, 64, 0, 15, clamps=True)
-    opened._controls._limits["gain"] = Limits(0, 255, 1, 0)  # it said 255
+    opened._controls._controls._limits["gain"] = Limits(0, 255, 1, 0)  # it said 255
     report = opened.lock(CameraProfile(gain=200, settle_frames=0))
     gain = next(control for control in report.controls if control.name == "gain")
     assert (gain.read_back, gain.note) == (15, "set to 200, but the camera says 15")
@@ -183,7 +183,7 @@ def test_a_camera_without_exposure_control_says_so(
 ) -> None:
     camera.specific = video_control(camera_controls=0x027A20)  # as an Insta360 Link announces
     report = open_fake(camera, monkeypatch).lock(CameraProfile(settle_frames=0))
-    assert any("announces no exposure time" in warning for warning in report.warnings)
+    assert any("has no exposure time" in warning for warning in report.warnings)
 
 
 def test_a_refusal_is_reported_with_the_cameras_own_reason(opened: UvcCamera, camera: FakeCamera) -> None:
@@ -200,7 +200,7 @@ def test_an_exposure_that_is_refused_while_the_light_is_asked_is_no_failure(
     opened: UvcCamera, camera: FakeCamera
 ) -> None:
     camera.controls[CT, 0x04].low = 40  # though it said 3: the half of 5 ms is refused
-    opened._controls._limits["exposure_time_absolute"] = Limits(3, 2047, 1, 250)
+    opened._controls._controls._limits["exposure_time_absolute"] = Limits(3, 2047, 1, 250)
     report = opened.lock(PROFILE)
     exposure = next(control for control in report.controls if control.name == "exposure_s")
     assert (exposure.read_back, camera.cur(CT, 0x04)) == (0.005, 50)
