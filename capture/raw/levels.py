@@ -208,6 +208,8 @@ def _deltas(raw: Directory, tag: int, count: int) -> NDArray[np.float32]:
 
 def _check(levels: Levels) -> None:
     numbers = [levels.black, levels.rows, levels.columns, levels.white]
+    if not levels.white.size:
+        raise ImageError("its white level is empty")
     if not all(np.isfinite(values).all() for values in numbers) or not (levels._range() > 0).all():
         raise ImageError(
             f"its white level ({', '.join(f'{w:g}' for w in levels.white)}) is not above its black level "

@@ -21,7 +21,7 @@ from capture.errors import ImageError
 
 Floats = NDArray[np.float32]
 
-# Pixels round a sample whose value it goes into. With PPG a cross, found by changing samples of random pictures.
+# Pixels into which a sample goes. With PPG a cross, found by changing samples of random pictures.
 # X-Trans interpolates from less than the square; which of several directions it then takes is settled further
 # round, and none of them is wrong.
 _OTHER_REACH = np.ones((9, 9), np.uint8)

@@ -306,6 +306,7 @@ def test_a_missing_file_is_named(tmp_path):
         ({"opcodes3": b""}, "opcode list of 0 bytes"),
         ({"active": (0, 0, 99, 99)}, "ActiveArea|LibRaw says"),
         ({"active": (8, 8, 12, 30)}, "less than any sensor|LibRaw says"),
+        ({"extra": {50717: (3, [])}}, "white level is empty"),
         ({"extra": {50713: (3, [0, 0])}}, "BlackLevelRepeatDim"),
         ({"extra": {50713: (3, [5, 5])}}, "BlackLevel has"),
         ({"black": BLACK, "delta_v": [1.0] * 5}, "5 values for 32"),
