@@ -156,20 +156,20 @@ def test_edges_are_told_in_the_clock_of_the_host(cdc_acm):
     assert edges[0].time_s == pytest.approx(asked.start_s, abs=TOLERANCE_S)
 
 
-def test_a_second_program_is_refused(rig):
-    with open_flash(rig.node), pytest.raises(FlashError, match="in use"):
-        open_flash(rig.node)
+def test_a_second_program_is_refused(cdc_acm):
+    with open_flash(cdc_acm.node), pytest.raises(FlashError, match="in use"):
+        open_flash(cdc_acm.node)
 
 
-def test_off_in_a_flash_is_dark_and_confirmed(rig):
-    with open_flash(rig.node) as flash:
+def test_off_in_a_flash_is_dark_and_confirmed(ftdi):
+    with open_flash(ftdi.node) as flash:
         flash.start(train(count=50, on_s=0.25))
-        until(lambda: rig.lit, "light")
+        until(lambda: ftdi.lit, "light")
         assert flash.off() is True
-        until(lambda: not rig.lit, "darkness", 1.0)
-        count = len(rig.edges)
+        until(lambda: not ftdi.lit, "darkness", 1.0)
+        count = len(ftdi.edges)
         time.sleep(1.2)
-        assert len(rig.edges) == count
+        assert len(ftdi.edges) == count
 
 
 def test_a_flash_pulled_out_of_the_bus_is_gone_and_goes_dark_by_itself(rig):
@@ -189,7 +189,7 @@ def test_a_flash_pulled_out_of_the_bus_is_gone_and_goes_dark_by_itself(rig):
     assert len(rig.edges) == count
 
 
-def test_a_program_that_is_killed_leaves_the_flash_dark(rig):
+def test_a_program_that_is_killed_leaves_the_flash_dark(ftdi):
     program = (
         "import sys, time\n"
         "from capture.devices.table import open_flash\n"
@@ -199,16 +199,16 @@ def test_a_program_that_is_killed_leaves_the_flash_dark(rig):
         "time.sleep(60)\n"
     )
     environment = os.environ | {"PYTHONPATH": os.getcwd()}
-    process = subprocess.Popen([sys.executable, "-c", program, rig.node], env=environment)
-    until(lambda: rig.lit, "light")
+    process = subprocess.Popen([sys.executable, "-c", program, ftdi.node], env=environment)
+    until(lambda: ftdi.lit, "light")
     process.send_signal(signal.SIGKILL)
     process.wait(10)
     time.sleep(2.0)
-    count = len(rig.edges)
+    count = len(ftdi.edges)
     time.sleep(1.0)
-    assert not rig.lit
-    assert len(rig.edges) == count
-    assert max(off_s - on_s for (on_s, _), (off_s, _) in list(pairwise(rig.edges))[::2]) <= 0.25
+    assert not ftdi.lit
+    assert len(ftdi.edges) == count
+    assert max(off_s - on_s for (on_s, _), (off_s, _) in list(pairwise(ftdi.edges))[::2]) <= 0.25
 
 
 def test_a_reset_of_the_flash_is_noticed_and_a_new_train_may_follow(cdc_acm):

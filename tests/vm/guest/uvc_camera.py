@@ -10,7 +10,6 @@ packets, the loss of settings between streams.
 import struct
 import time
 from dataclasses import dataclass, field
-from itertools import count
 
 import cv2
 import numpy as np
@@ -30,6 +29,18 @@ BACKLIGHT, BRIGHTNESS, CONTRAST, GAIN = (PROCESSING, 1), (PROCESSING, 2), (PROCE
 POWER_LINE, SHARPNESS, WHITE_BALANCE = (PROCESSING, 5), (PROCESSING, 8), (PROCESSING, 10)
 AUTO_WHITE_BALANCE = (PROCESSING, 11)
 MANUAL, APERTURE_PRIORITY = 1, 8  # of AE_MODE
+#: After a lock with 5 ms, gain 16, 5000 K, focus 50 and mains of 50 Hz.
+LOCKED = {
+    AE_MODE: MANUAL,
+    AE_PRIORITY: 0,
+    EXPOSURE: 50,
+    GAIN: 16,
+    AUTO_WHITE_BALANCE: 0,
+    WHITE_BALANCE: 5000,
+    AUTO_FOCUS: 0,
+    FOCUS: 50,
+    POWER_LINE: 1,
+}
 
 SET_CUR, GET_CUR, GET_MIN, GET_MAX, GET_RES, GET_LEN, GET_INFO, GET_DEF = 1, *range(0x81, 0x88)
 _PROBE, _COMMIT = 1, 2
@@ -84,7 +95,7 @@ class _VideoControl(Interface):
     def __init__(self):
         super().__init__()
         self.controls = _controls()
-        self.received = []
+        self.received, self.refused = [], []
 
     def extra_descriptors(self):
         # bmControls: the positions of the controls above in tables 3-6 and 3-8.
@@ -111,6 +122,7 @@ class _VideoControl(Interface):
                 else control.low <= value <= control.high
             )
             if len(data) != control.length or not allowed or self._by_itself(key):
+                self.refused.append((key, value, len(data)))
                 raise Stall
             control.value = value
             return b""
@@ -139,8 +151,8 @@ class _VideoStreaming(Interface):
 
     def __init__(self, picture):
         super().__init__()
-        self.broken, self.short = set(), set()
-        self.frames = count()
+        self.broken = set()
+        self.number = 0
         self._picture = picture
         self._negotiated = {_PROBE: (1, _INTERVALS_100NS[0]), _COMMIT: (1, _INTERVALS_100NS[0])}
         self._streaming = False
@@ -221,11 +233,9 @@ class _VideoStreaming(Interface):
 
     def _begin_frame(self):
         kind, interval = self._negotiated[_COMMIT]
-        self._number = next(self.frames)
+        self.number += 1
         rgb = self._picture(self._next_frame_s)
         self._rest = _yuyv(rgb) if kind == 1 else cv2.imencode(".jpg", rgb[..., ::-1])[1].tobytes()
-        if self._number in self.short:
-            self._rest = self._rest[: len(self._rest) // 2]
         self._mark ^= 1
         self._next_frame_s += interval * 1e-7
 
@@ -234,7 +244,7 @@ class _VideoStreaming(Interface):
             return b""
         part, self._rest = self._rest[: _PACKET_BYTES - 2], self._rest[_PACKET_BYTES - 2 :]
         flags = self._mark | (0 if self._rest else _END_OF_FRAME)
-        return bytes([2, flags | (_ERROR if self._number in self.broken else 0)]) + part
+        return bytes([2, flags | (_ERROR if self.number in self.broken else 0)]) + part
 
 
 _YUY2 = bytes.fromhex("5955593200001000800000aa00389b71")
@@ -254,17 +264,15 @@ class UvcCamera:
 
     Attributes:
         device: To be plugged in.
-        received: ((entity, selector), value, bytes) of each SET_CUR so far, refused ones too.
-        broken: Numbers of frames that the camera itself marks as damaged.
-        short: Numbers of frames of which the second half is missing.
+        received: ((entity, selector), value, bytes) of each SET_CUR so far.
+        refused: Those among them that the camera stalled.
         lamp: Gives [(on_s, off_s)] of a lamp's pulses by CLOCK_MONOTONIC.
     """
 
     def __init__(self, serial="0001", readout_s=0.02):
         self._control = _VideoControl()
         self._streaming = _VideoStreaming(self._picture)
-        self.received = self._control.received
-        self.broken, self.short = self._streaming.broken, self._streaming.short
+        self.received, self.refused = self._control.received, self._control.refused
         self.lamp = list
         self._readout_s = readout_s
         self._settings = []
@@ -277,6 +285,14 @@ class UvcCamera:
     def value(self, key):
         """What the camera has now."""
         return self._control.controls[key].value
+
+    def settings(self):
+        """What it has of what a lock sets."""
+        return {key: self.value(key) for key in LOCKED}
+
+    def break_frames(self, *ahead):
+        """The camera marks frames to come as damaged; 1 = the next but one."""
+        self._streaming.broken.update(self._streaming.number + one for one in ahead)
 
     def turn(self, key, value):
         """Somebody else changes a control at the camera."""

@@ -37,6 +37,7 @@ class Controls:
         return self._call(structs.G_EXT_CTRLS, name, 0)
 
     def _call(self, request, name, value):
+        assert name in self._ids, f"no control {name}; there are {sorted(self._ids)}"
         control = structs.ExtControl(id=self._ids[name])
         control.value = value
         block = structs.ExtControls(which=self._ids[name] & 0x0FFF0000, count=1)
