@@ -20,13 +20,17 @@ from dataclasses import fields, replace
 
 from capture.devices.bench import Bench
 from capture.devices.camera import CameraDevice
+from capture.devices.url_options import parse_options
 from capture.devices.v4l2.camera import V4l2Camera
 from capture.devices.v4l2.fake_driver import FAKE_PATH, FakeKernel
 from capture.devices.v4l2.fake_quirks import PROFILES, Quirks
 from capture.errors import CameraError
 
 _RATES = (30.0, 15.0)
-_SWITCHES = {field.name: field.type for field in fields(Quirks) if field.type in ("bool", "int")}
+_KINDS = {"bool": bool, "int": int}
+_KNOWN = {"profile": str, "seed": int, "width": int, "height": int} | {
+    field.name: _KINDS[str(field.type)] for field in fields(Quirks) if str(field.type) in _KINDS
+}
 
 
 def open_camera(rest: str, bench: Bench) -> CameraDevice:
@@ -48,38 +52,15 @@ def list_cameras() -> tuple[str, ...]:
 
 def parse(rest: str) -> tuple[Quirks, int]:
     """(quirks, seed) of "profile=c920;seed=1;..."."""
-    settings = dict(part.partition("=")[::2] for part in rest.split(";") if part)
+    settings = parse_options(rest, _KNOWN, CameraError, scheme="fake-v4l2")
     profile = settings.pop("profile", "plain")
     if profile not in PROFILES:
         raise CameraError(f"fake-v4l2 has no profile {profile!r}; known are {', '.join(PROFILES)}.")
     quirks = PROFILES[profile]
-    seed = _number("seed", settings.pop("seed", "0"))
-    width, height = settings.pop("width", ""), settings.pop("height", "")
-    if bool(width) != bool(height):
-        raise CameraError(
-            f"fake-v4l2:{rest} is not understood: width and height go together; give both sides."
-        )
-    if width:
-        size = (_even("width", width), _even("height", height))
-        quirks = replace(quirks, modes=tuple((name, ((size, _RATES),)) for name, _ in quirks.modes))
-    for name, text in settings.items():
-        if name not in _SWITCHES:
-            known = ", ".join(["profile", "seed", "width", "height", *_SWITCHES])
-            raise CameraError(f"fake-v4l2:{rest} is not understood: {name!r} is not one of {known}.")
-        number = _number(name, text or "1")
-        value = bool(number) if _SWITCHES[name] == "bool" else number
-        quirks = replace(quirks, **{name: value})  # type: ignore[arg-type]
-    return quirks, seed
-
-
-def _number(name: str, text: str) -> int:
-    if not text.isdecimal():
-        raise CameraError(f"fake-v4l2: {name} is {text!r}; it must be a whole number.")
-    return int(text)
-
-
-def _even(name: str, text: str) -> int:
-    number = _number(name, text)
-    if number < 16 or number % 2 or number > 8192:
-        raise CameraError(f"fake-v4l2: {name} is {text}; it must be even, 16..8192.")
-    return number
+    seed, width, height = (settings.pop(name, 0) for name in ("seed", "width", "height"))
+    if width or height:
+        sides = (width, height)
+        if not all(16 <= side <= 8192 and side % 2 == 0 for side in sides):
+            raise CameraError(f"fake-v4l2:{rest}: width and height must both be given, even, 16..8192.")
+        quirks = replace(quirks, modes=tuple((name, ((sides, _RATES),)) for name, _ in quirks.modes))
+    return replace(quirks, **settings), seed

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 from capture.devices.camera import CameraProfile, CapturedFrame, ControlReport, StreamFormat
 from capture.devices.light_check import LightCheck, mean_light, skip_latency, verify_exposure
 from capture.devices.v4l2 import structs as v4l2
 from capture.devices.v4l2.controls import Control, Controls
+from capture.devices.v4l2.held import AS_LEFT, LEFT_ALONE, MATCHED, Held, why_not
 from capture.devices.v4l2.settings import (
     AUTOMATICS,
     FINDERS,
@@ -18,7 +18,6 @@ from capture.devices.v4l2.settings import (
     asks,
     automatic_exposure,
     from_device,
-    mains_of,
     manual_exposure,
     own_name,
     to_device,
@@ -29,35 +28,8 @@ from capture.devices.v4l2.settings import (
 _LOOKS, _FRAMES_BETWEEN, _SETTLED = 12, 10, 0.02
 #: After the automatics the frozen picture must have the light of the automatic one, within this factor.
 _SAME_LIGHT, _MATCHES = 1.15, 4
-#: White balance and focus stay where their automatic has left them: what a driver says of them in automatic
-#: mode is often old, and written back it would change the picture.
-_LEFT_ALONE = ("white_balance_k", "focus")
 #: Controls of one driver alone (V4L2_CTRL_DRIVER_PRIV) are none of ours.
 _DRIVERS_OWN = 0x1000
-
-
-@dataclass
-class _Locked:
-    """A control that is held.
-
-    Attributes:
-        control: As it was when it was set.
-        name: In the report.
-        wanted: In the device's unit.
-        asked: In the report's unit; None = found, not asked for.
-        note: What is to be said of it.
-    """
-
-    control: Control
-    name: str
-    wanted: int
-    asked: float | None
-    note: str = ""
-
-    @property
-    def found(self) -> bool:
-        """Whether it is where an automatic has left it, and was not written."""
-        return self.name in _LEFT_ALONE and self.asked is None
 
 
 class ControlLock:
@@ -80,7 +52,7 @@ class ControlLock:
         self._read = read
         self._format = format
         self._saved: dict[int, tuple[Control, int]] = {}
-        self._locked: dict[int, _Locked] = {}
+        self._locked: dict[int, Held] = {}
         self._check: LightCheck | None = None
         self._fresh = True
         self._warnings: list[str] = []
@@ -128,12 +100,12 @@ class ControlLock:
         drifted = []
         for identity, locked in self._locked.items():
             value = self._controls.get(locked.control)
-            held = self._reported(locked, locked.wanted)
-            found = None if value is None else self._reported(locked, value)
+            held = locked.in_profile(locked.wanted)
+            found = None if value is None else locked.in_profile(value)
             if value is not None and value != locked.wanted:
                 note = f"changed from {held:g} to {found:g} behind our back"
             elif changes.get(identity, locked.wanted) != locked.wanted:
-                note = f"was changed to {self._reported(locked, changes[identity]):g} and back"
+                note = f"was changed to {locked.in_profile(changes[identity]):g} and back"
             else:
                 continue
             drifted.append(ControlReport(name=locked.name, requested=held, read_back=found, note=note))
@@ -156,7 +128,7 @@ class ControlLock:
     # ------------------------------------------------------------------------------ the steps of a lock
 
     def _open_settings(
-        self, profile: CameraProfile, known: dict[int, Control], earlier: dict[int, _Locked]
+        self, profile: CameraProfile, known: dict[int, Control], earlier: dict[int, Held]
     ) -> dict[str, float | None]:
         """Name -> value in the report's unit; None = to be found by the automatics."""
         values: dict[str, float | None] = {}
@@ -235,8 +207,8 @@ class ControlLock:
         found = asked is None
         if name == "exposure_s" and found:
             value = without_banding(value, profile.mains_hz)
-        note = "as the automatic left it" if found and self._fresh else ""
-        write = not (found and name in _LEFT_ALONE)
+        note = AS_LEFT if found and self._fresh else ""
+        write = not (found and name in LEFT_ALONE)
         self._hold(control.id, name, to_device(name, value), asked, note=note, write=write)
 
     def _lock_mains(self, known: dict[int, Control], mains_hz: int | None) -> None:
@@ -264,11 +236,11 @@ class ControlLock:
         number = control.nearest(value)
         notes = [note] if note else []
         if abs(number - value) > 1e-6 * abs(value) and asked is not None:
-            notes.append(_why_not(control, value, number, name))
+            notes.append(why_not(control, value, number, name))
         differs = write and (self._fresh or self._controls.get(control) != number)
         if differs and (refusal := self._controls.set(control, number)):
             notes.append(f"refused: {refusal}")
-        self._locked[identity] = _Locked(control, name, number, asked, "; ".join(notes))
+        self._locked[identity] = Held(control, name, number, asked, "; ".join(notes))
 
     def _settle_down(self) -> None:
         """A second try for what did not stay: some cameras lose a write while they change mode."""
@@ -304,9 +276,7 @@ class ControlLock:
             self._controls.set(locked.control, number)
             skip_latency(self._read)
         if locked.wanted != first:
-            locked.note = (
-                f"matched to the light of the automatic, which said {from_device('exposure_s', first):g} s"
-            )
+            locked.note = f"{MATCHED}, which said {from_device('exposure_s', first):g} s"
 
     def _verify(self) -> LightCheck | None:
         """The light's word on the exposure; after a failure manual mode is set anew and it is asked again."""
@@ -327,7 +297,7 @@ class ControlLock:
             check = self._verify_once(locked)
         return check
 
-    def _verify_once(self, locked: _Locked) -> LightCheck:
+    def _verify_once(self, locked: Held) -> LightCheck:
         def set_exposure(exposure_s: float) -> float:
             number = locked.control.nearest(to_device("exposure_s", exposure_s))
             self._controls.set(locked.control, number)
@@ -345,7 +315,12 @@ class ControlLock:
     def _reports(
         self, profile: CameraProfile, known: dict[int, Control], check: LightCheck | None
     ) -> tuple[ControlReport, ...]:
-        reports = [self._report(locked, check) for locked in self._locked.values()]
+        reports = []
+        for locked in self._locked.values():
+            report, trouble = locked.report(self._controls.get(locked.control), check)
+            reports.append(report)
+            if trouble:
+                self._warn(f"{locked.name}: {trouble}.")
         for name in SETTINGS:
             asked = asks(profile, name)
             if asked is not None and all(report.name != name for report in reports):
@@ -357,40 +332,6 @@ class ControlLock:
                 found = None if value is None else float(value)
                 reports.append(ControlReport(name=own_name(control), requested=None, read_back=found))
         return tuple(reports)
-
-    def _report(self, locked: _Locked, check: LightCheck | None) -> ControlReport:
-        value = self._controls.get(locked.control)
-        notes = [locked.note] if locked.note else []
-        if value is not None and value != locked.wanted:
-            held, found = self._reported(locked, locked.wanted), self._reported(locked, value)
-            notes += [] if locked.found else [f"the device has {found:g}, not {held:g}"]
-            locked.wanted = value
-        elif value is None:
-            notes.append("the device does not tell it")
-        verified = None
-        if locked.control.id == v4l2.CID_EXPOSURE_ABSOLUTE and check is not None:
-            verified = check.verified
-            notes.append(check.note)
-        said = "; ".join(notes)
-        trouble = [note for note in notes if not _harmless(note, check)]
-        if trouble:
-            self._warn(f"{locked.name}: {'; '.join(trouble)}.")
-        requested = locked.asked
-        if requested is None and locked.name not in SETTINGS:
-            requested = self._reported(locked, locked.wanted)
-        return ControlReport(
-            name=locked.name,
-            requested=requested,
-            read_back=None if value is None else self._reported(locked, value),
-            verified=verified,
-            note=said,
-        )
-
-    def _reported(self, locked: _Locked, value: int) -> float:
-        if locked.name == "mains_hz":
-            hertz = mains_of(value)
-            return float(value) if hertz is None else hertz
-        return from_device(locked.name, value)
 
     # ---------------------------------------------------------------------------------- small matters
 
@@ -425,17 +366,3 @@ class ControlLock:
 
     def _warn(self, sentence: str) -> None:
         self._warnings.append(sentence)
-
-
-def _harmless(note: str, check: LightCheck | None) -> bool:
-    if check is not None and note == check.note:
-        return check.verified is True
-    return note.startswith(("as the automatic", "matched to the light"))
-
-
-def _why_not(control: Control, value: float, number: int, name: str) -> str:
-    asked, taken = from_device(name, value), from_device(name, number)
-    low, high = from_device(name, control.minimum), from_device(name, control.maximum)
-    if not control.minimum <= value <= control.maximum:
-        return f"{asked:g} is outside the device's {low:g}..{high:g}; {taken:g} was set"
-    return f"{asked:g} was rounded to {taken:g}, the device's step"

@@ -73,10 +73,10 @@ def test_every_profile_can_be_opened_and_names_its_settings():
     ("description", "words"),
     [
         ("profile=webcam", "no profile 'webcam'; known are plain, c920"),
-        ("speed=3", "'speed' is not one of profile, seed"),
+        ("speed=3", "'speed=3'; known are profile=..., seed=..."),
         ("seed=x", "seed is 'x'"),
-        ("width=64", "both sides"),
-        ("width=63;height=48", "width is 63"),
+        ("width=64", "must both be given"),
+        ("width=63;height=48", "even"),
     ],
 )
 def test_a_description_that_is_not_understood_lists_what_is(description, words):
