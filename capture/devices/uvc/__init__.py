@@ -11,7 +11,8 @@ the same camera is shown by the light: a halved exposure must halve it.
              refused on others. Where they are refused, `opencv:` is what is left, and OpenCV sets no
              exposure there: set it in the maker's program.
     Windows  libusb reaches a camera only when its control interface has a libusb driver (libusbK, by Zadig),
-             which takes the camera away from every other program. `opencv:` is the usual way.
+             which takes the camera away from every other program, OpenCV too: the pictures must then come
+             from somewhere else. `opencv:` without `uvc:` is the usual way.
 
 The two last are built on what the documentation says and were not tried on such machines.
 """

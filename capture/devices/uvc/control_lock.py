@@ -141,7 +141,7 @@ class ControlLock:
         return _seconds(self._controls.get(_EXPOSURE))
 
     def force_manual(self) -> None:
-        """The lock's exposure mode, by way of another: a camera can have lost the mode that it says it has."""
+        """The lock's exposure mode, by way of another: a camera can have lost the mode it says it has."""
         if (manual := self._locked.get(_AE_MODE)) is not None:
             self._force_manual(manual)
 
