@@ -23,7 +23,7 @@ from capture.devices.v4l2.locking import ControlLock
 from capture.devices.v4l2.node import Mode, VideoNode
 from capture.devices.v4l2.stamps import Stamps
 from capture.devices.v4l2.stream import RawFrame, Stream
-from capture.errors import CameraError
+from capture.errors import CameraError, CameraGoneError
 
 _log = logging.getLogger(__name__)
 
@@ -130,8 +130,11 @@ class V4l2Camera:
         return self._lock.check()
 
     def restore(self) -> tuple[str, ...]:
-        """Puts the controls back to what they were before the first lock."""
-        return self._lock.restore()
+        """Puts the controls back to what they were before the first lock; a camera that is gone says so."""
+        try:
+            return self._lock.restore()
+        except CameraGoneError as error:
+            return (f"The camera's controls could not be put back: {error}",)
 
     def close(self) -> None:
         """Stops and lets go; harmless when repeated or when the device is gone."""
