@@ -37,6 +37,8 @@ LEAD_S = 1e-3
 SHORTEST_ON_S = 20e-6
 STOP_TRIES = 5
 _TEND_S = 0.02
+#: So near its end nobody asks why a train has ended.
+_END_SLACK_S = 0.3
 #: At most so many reads in a row, so that a line that babbles does not keep callers away.
 _READS = 32
 #: How long a call waits for another one that is on the line: a new handshake takes up to six seconds.
@@ -93,6 +95,7 @@ class FirmwareFlash:
         self._log = EdgeLog()
         self._failure: FlashError | None = None
         self._needs_hello = True
+        self._running: tuple[Stat, float] | None = None  # how the device took the train, and when that ends
         # Dark too when nobody closes it: at the end of the program, or when it is forgotten.
         self._finalizer = weakref.finalize(self, _abandon, transport)
 
@@ -104,7 +107,7 @@ class FirmwareFlash:
         """
         with self._mine():
             shake_hands(self._link)
-            self._link.ask(Stop())  # a train of a host before us
+            self._link.ask(Stop())
             self._needs_hello = False
         if isinstance(self._clock, MonotonicClock) and self._thread is None:
             wanted = (weakref.ref(self), self._closing)
@@ -167,6 +170,7 @@ class FirmwareFlash:
                 self._collect()
             if isinstance(answer, Stat) and self._link.hello is not None:
                 self._log.begin(message, self._link.hello.tick_hz, answer.pulses)
+                self._running = (answer, train.end_s)
 
     def poll(self) -> tuple[FlashEdge, ...]:
         """The edges since the last call, with the device's own times.
@@ -284,6 +288,24 @@ class FirmwareFlash:
         trouble = link.take_trouble()
         if trouble is not None and not isinstance(self._failure, FlashGoneError):
             self._failure = trouble
+            self._running = None
+        self._watch_train()
+
+    def _watch_train(self) -> None:
+        """A device that ends its train says so once; where that was lost, its next STAT says it again."""
+        stat = self._link.stat
+        if self._running is None or stat is None:
+            return
+        taken, end_s = self._running
+        newer = (stat.tick - taken.tick) % (1 << 64) < 1 << 63
+        if self._clock.now_s() > end_s - _END_SLACK_S:
+            self._running = None
+        elif newer and stat.state != State.TRAIN:
+            self._running = None
+            self._failure = self._failure or FlashError(
+                f"{self._link.description} has ended its train by itself after {stat.pulses - taken.pulses} "
+                "flashes; it heard nothing from this program for a while. Start again."
+            )
 
     def _raise_failure(self) -> None:
         if self._closed:
@@ -296,6 +318,7 @@ class FirmwareFlash:
         raise failure
 
     def _stop(self, tries: int) -> bool:
+        self._running = None
         try:
             if self._link.hello is None:
                 self._link.send(Stop(), flush=True)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from capture.devices.firmware_flash.link import FirmwareLink
 from capture.errors import FlashError
-from firmware_protocol import Decoder, Err, Fault, FaultReason, Hello, Packet
+from firmware_protocol import Decoder, Err, Fault, FaultReason, Hello, Packet, Stop
 from firmware_protocol.limits import PROTOCOL_MAJOR, PROTOCOL_MINOR, WIRE_VERSION
 from firmware_protocol.messages import Capability, schema_crc
 
@@ -42,6 +42,7 @@ def shake_hands(link: FirmwareLink, *, after_reset: bool = False, patience_s: fl
         hello = _find(link, end_s)
         found_s = link.now_s()
         link.accept(hello)
+        link.send(Stop(), flush=True)  # a train of a host before us
         link.heartbeat = True
         for _ in range(BURST):
             link.ping()

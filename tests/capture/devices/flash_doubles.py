@@ -268,6 +268,27 @@ class StepLine:
             raise FlashGoneError(f"{self.description} is not there any more.")
 
 
+def damage(data, random, odds):
+    """Bytes as a bad line passes them on: each at these odds flipped, lost, doubled, among foreign ones."""
+    out = bytearray()
+    for byte in data:
+        if not odds or random.random() >= odds:
+            out.append(byte)
+            continue
+        kind = random.randrange(6)
+        if kind == 0:
+            out.append(byte ^ 1 << random.randrange(8))
+        elif kind == 2:
+            out += bytes((byte, byte))
+        elif kind == 3:
+            out += random.randbytes(random.randrange(1, 80)) + bytes((byte,))
+        elif kind == 4:
+            out += bytes(out[-40:]) + bytes((byte,))  # what has just passed, again
+        elif kind == 5:
+            out += b"\0"
+    return bytes(out)
+
+
 class LiveDevice:
     """A program in real time.
 

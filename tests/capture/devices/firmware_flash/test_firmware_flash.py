@@ -187,6 +187,28 @@ def test_a_host_that_was_held_up_for_two_seconds_is_told_that_the_light_has_gone
         assert [(edge.pulse, edge.on) for edge in edges][-2:] == [(0, True), (0, False)]
 
 
+def test_a_train_that_the_device_has_ended_is_noticed_though_its_word_was_lost(rig):
+    with rig.open() as flash:
+        lit_soon(rig, flash)
+        take = rig.line.device.take
+        rig.line.device.take = lambda: take() and b""  # ERR 8 is lost
+        rig.clock.sleep(1.7)
+        rig.line.device.take = take
+        assert "ended its train by itself after 2 flashes" in poll_until_it_raises(
+            rig, flash, FlashError, 1.1
+        )
+        assert rig.watch(flash, 0.5) == []
+
+
+def test_a_train_of_a_host_before_us_ends_when_the_flash_is_opened(rig):
+    first = rig.open()
+    lit_soon(rig, first, on_s=0.25)
+    with rig.open() as second:
+        assert not rig.lamp()[-1][1]
+        assert len(rig.lamp()) == 2
+        assert rig.watch(second, 1.0) == []
+
+
 def test_a_train_that_is_too_near_is_refused_with_how_near_it_may_be(rig):
     with (
         rig.open() as flash,

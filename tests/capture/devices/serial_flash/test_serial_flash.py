@@ -11,10 +11,11 @@ import subprocess
 import sys
 import threading
 import time
+from random import Random
 
 import pytest
-from flash_contract import WATCHDOG_S, FlashContract, FlashRig
-from flash_doubles import LiveDevice, build
+from flash_contract import WATCHDOG_S, FlashContract, FlashRig, edge_count
+from flash_doubles import LiveDevice, build, damage
 
 from capture.devices.bench import Bench, MonotonicClock
 from capture.devices.firmware_flash.flash import open_firmware_flash
@@ -35,6 +36,18 @@ class MutedLine(SerialLine):
     def write(self, data):
         if not self.muted:
             super().write(data)
+
+
+class DamagingLine(SerialLine):
+    """One byte in a hundred, both ways."""
+
+    random = Random(11)
+
+    def write(self, data):
+        super().write(damage(data, self.random, 0.01))
+
+    def read(self, timeout_s):
+        return damage(super().read(timeout_s), self.random, 0.01)
 
 
 class LiveRig(FlashRig):
@@ -144,6 +157,19 @@ def test_a_socket_is_a_line_too(served, double):
     with open_by_url(served) as flash:
         expect_one_flash(rig, flash)
         assert not flash.link_report()["uart_pace"]
+
+
+def test_a_line_that_damages_in_real_time_costs_repeats_and_no_flash(double):
+    rig = LiveRig(double.path, double)
+    before = edge_count(rig)
+    line = DamagingLine(double.path, rig.clock)
+    with open_firmware_flash(line, Bench(rig.clock), url=double.path, back_end="serial") as flash:
+        flash.start(PulseTrain(start_s=rig.clock.now_s() + 0.8, period_s=0.4, on_s=0.05, count=3))
+        rig.watch(flash, 1.9)
+        assert flash.off()
+        report = flash.link_report()
+    assert report["resyncs"] > 0
+    assert [on for _, on in rig.lamp()[before:]] == [True, False] * 3
 
 
 def test_a_device_that_is_pulled_out_is_gone_at_the_next_poll(firmware_directory, tmp_path):
