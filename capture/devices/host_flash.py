@@ -1,8 +1,8 @@
 """A lamp that only knows on and off, made a `FlashDevice`: a thread switches it when its schedule says so.
 
 All decisions are in `HostSchedule`; the thread sleeps until the next one and carries it out. In simulated
-time there is no thread: whoever moves the clock calls `run_due` at `next_s`. The host's clock is all there
-is: when the whole machine hangs, a lamp without a watchdog of its own stays as it is.
+time there is no thread: whoever moves the clock calls `run_due` at `next_s`. A guard may stand by for the
+case that this process dies; when the whole machine hangs, a lamp without a watchdog stays as it is.
 
 What went wrong in the thread turns the lamp off, ends the train and comes out of the next `poll`.
 """
@@ -70,17 +70,29 @@ class HostLamp(Protocol):
         """Puts back what was changed on the device, but stays dark, and lets go of it; may raise."""
 
 
+class HostGuard(Protocol):
+    """Who puts the lamp out should this process die. Never raises."""
+
+    def lit(self, on: bool) -> None:
+        """Told before the light goes on and after it is off."""
+
+    def end(self) -> None:
+        """The lamp is dark and closed."""
+
+
 class HostFlash:
     """A `FlashDevice` out of a lamp that the host switches."""
 
-    def __init__(self, lamp: HostLamp, clock: Clock) -> None:
+    def __init__(self, lamp: HostLamp, clock: Clock, guard: HostGuard | None = None) -> None:
         """Takes over an opened lamp.
 
         Args:
             lamp: That is dark.
             clock: Of the bench. In simulated time `run_due` has to be called; else a thread is started.
+            guard: Of the lamp; None = nobody.
         """
         self._lamp = lamp
+        self._guard = guard
         self._clock = clock
         can = lamp.capabilities
         self._schedule = HostSchedule(can.latency_s or 0.0, can.jitter_s or 0.0)
@@ -94,7 +106,7 @@ class HostFlash:
         self._lock = threading.RLock()
         self._wake = threading.Event()
         # Dark too when nobody closes it: at the end of the program, or when it is forgotten.
-        self._finalizer = weakref.finalize(self, _darken, lamp, self._lock, self._closed)
+        self._finalizer = weakref.finalize(self, _darken, lamp, self._lock, self._closed, guard)
         self._threaded = isinstance(clock, MonotonicClock)
         if self._threaded:
             wanted = (weakref.ref(self), self._wake)
@@ -161,7 +173,7 @@ class HostFlash:
             if step is not None:
                 self._carry_out(step)
             else:
-                self._lamp.switch(False)
+                self._switch(False)
             self._retries = 0
             return self._lamp.confirm_dark()
         except Exception as error:
@@ -172,8 +184,8 @@ class HostFlash:
                 self._lock.release()
 
     def link_report(self) -> dict[str, Any]:
-        """Flashes made and left out, and what the lamp says of itself."""
-        return self._schedule.report() | self._lamp.report()
+        """Flashes made and left out, whether there is a guard, and what the lamp says of itself."""
+        return self._schedule.report() | {"guarded": self._guard is not None} | self._lamp.report()
 
     def next_s(self) -> float | None:
         """When `run_due` has something to do; None = never."""
@@ -210,6 +222,8 @@ class HostFlash:
             self._finalizer.detach()
             with contextlib.suppress(FlashError):  # it is gone: nothing can be put back
                 self._lamp.close()
+            if self._guard is not None:
+                self._guard.end()
         self._wake.set()
 
     def __enter__(self) -> Self:
@@ -249,9 +263,16 @@ class HostFlash:
             train = self._schedule.train
             assert train is not None
             self._lamp.arm(train.on_s)
+            if self._guard is not None:
+                self._guard.lit(True)
         before_s = self._clock.now_s()
-        self._lamp.switch(step.on)
+        self._switch(step.on)
         self._edges.append(self._schedule.done(step, before_s, self._clock.now_s()))
+
+    def _switch(self, on: bool) -> None:
+        self._lamp.switch(on)
+        if self._guard is not None and not on:
+            self._guard.lit(False)
 
     def _check_length(self) -> None:
         if self._schedule.last_on_s > LONGEST_ON_S + LATEST_S:
@@ -272,7 +293,7 @@ class HostFlash:
         step = self._schedule.drop()
         before_s = self._clock.now_s()
         try:
-            self._lamp.switch(False)
+            self._switch(False)
         except Exception as error:  # the failure is told already
             self._retries -= 1
             self._retry_s = self._clock.now_s() + _RETRY_S
@@ -315,13 +336,15 @@ def _serve(flash: weakref.ref[HostFlash], wake: threading.Event) -> None:
         wake.clear()
 
 
-def _darken(lamp: HostLamp, lock: threading.RLock, closed: threading.Event) -> None:
+def _darken(lamp: HostLamp, lock: threading.RLock, closed: threading.Event, guard: HostGuard | None) -> None:
     closed.set()  # the thread switches nothing any more
     locked = lock.acquire(timeout=_PATIENCE_S)
     try:
         with contextlib.suppress(Exception):  # the program ends; there is nobody to tell
             lamp.switch(False)
             lamp.close()
+            if guard is not None:
+                guard.end()
     finally:
         if locked:
             lock.release()

@@ -5,6 +5,7 @@
     litra.py       Logitech Litra Glow, Beam, Beam LX
     relay.py       relay boards "USBRelayN"
     blink1.py      blink(1), which goes dark by itself when the host dies
+    guard.py       a process that puts a lamp out when the one that lights it dies
     firmware.py    frames of firmware_protocol in reports of 64 bytes
 
 The bought lamps have no schedule of their own: `capture.devices.host_flash` switches them in time.

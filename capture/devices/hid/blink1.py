@@ -20,6 +20,7 @@ from typing import Any
 
 from capture.devices.bench import Bench, Clock
 from capture.devices.flash import LONGEST_ON_S, FlashCapabilities, FlashInfo
+from capture.devices.hid.guard import start_guard
 from capture.devices.hid.transport import (
     HidTransport,
     choose_device,
@@ -58,7 +59,8 @@ def open_flash(rest: str, bench: Bench) -> HostFlash:
     )
     transport = open_device(address)
     try:
-        return HostFlash(Blink1Lamp(transport, bench.clock), bench.clock)
+        lamp = Blink1Lamp(transport, bench.clock)
+        return HostFlash(lamp, bench.clock, start_guard(address, lamp.dark, bench))
     except BaseException:
         transport.close()
         raise
@@ -124,6 +126,11 @@ class Blink1Lamp:
             dimmable=True,
         )
 
+    @property
+    def dark(self) -> tuple[str, bytes]:
+        """The report that turns it off, for its guard."""
+        return "set", _report("n")
+
     def prepare(self, level: float) -> None:
         """Sets how bright the flashes to come are; the device's own gamma makes that nonlinear."""
         self._value = max(1, round(255 * level))
@@ -173,8 +180,7 @@ class Blink1Lamp:
         self._send("n", bytes((value, value, value)))
 
     def _send(self, command: str, parameters: bytes = b"", position: int = 0) -> None:
-        report = bytes((_REPORT_ID, ord(command))) + parameters.ljust(5, b"\0") + bytes((position,))
-        self._transport.send_feature(report.ljust(_SENT_BYTES, b"\0"))
+        self._transport.send_feature(_report(command, parameters, position))
 
     def _ask(self, command: str, position: int = 0) -> bytes:
         self._send(command, position=position)
@@ -185,3 +191,8 @@ class Blink1Lamp:
                 f"command {command!r}, which a blink(1) does not; close other programs that use it."
             )
         return answer
+
+
+def _report(command: str, parameters: bytes = b"", position: int = 0) -> bytes:
+    content = bytes((_REPORT_ID, ord(command))) + parameters.ljust(5, b"\0") + bytes((position,))
+    return content.ljust(_SENT_BYTES, b"\0")

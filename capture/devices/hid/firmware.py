@@ -103,9 +103,7 @@ def to_reports(data: bytes) -> list[bytes]:
 def find_firmware() -> list[HidAddress]:
     """The devices with our firmware that are plugged in."""
     return [
-        device
-        for device in find_devices(0, (), USAGE_PAGE)
-        if device.product.lower().startswith(PRODUCT) and device.usage_page in (0, USAGE_PAGE)
+        device for device in find_devices(0, (), USAGE_PAGE) if device.product.lower().startswith(PRODUCT)
     ]
 
 

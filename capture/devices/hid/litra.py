@@ -17,6 +17,7 @@ from typing import Any
 
 from capture.devices.bench import Bench, Clock
 from capture.devices.flash import FlashCapabilities, FlashInfo
+from capture.devices.hid.guard import start_guard
 from capture.devices.hid.hidpp import HidppLink
 from capture.devices.hid.transport import (
     HidTransport,
@@ -90,7 +91,7 @@ def open_flash(rest: str, bench: Bench) -> HostFlash:
     transport = open_device(address)
     try:
         lamp = LitraLamp(transport, bench.clock, kelvin=options.get("kelvin"), lumen=options.get("lumen"))
-        return HostFlash(lamp, bench.clock)
+        return HostFlash(lamp, bench.clock, start_guard(address, lamp.dark, bench))
     except BaseException:
         transport.close()
         raise
@@ -169,6 +170,11 @@ class LitraLamp:
     def capabilities(self) -> FlashCapabilities:
         """What it can do; the shortest flash is a guess on the safe side."""
         return FlashCapabilities(own_schedule=False, watchdog=False, shortest_on_s=0.05, dimmable=True)
+
+    @property
+    def dark(self) -> tuple[str, bytes]:
+        """The report that turns it off, for its guard."""
+        return "out", self._command(_SET_ON, b"\0")
 
     def prepare(self, level: float) -> None:
         """Sets the brightness; refuses a level below the model's lowest."""

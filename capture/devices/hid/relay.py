@@ -20,6 +20,7 @@ from typing import Any
 
 from capture.devices.bench import Bench, Clock
 from capture.devices.flash import FlashCapabilities, FlashInfo
+from capture.devices.hid.guard import start_guard
 from capture.devices.hid.transport import (
     HidAddress,
     HidTransport,
@@ -62,7 +63,8 @@ def open_flash(rest: str, bench: Bench) -> HostFlash:
     options = parse_options(rest, _OPTIONS, FlashError, scheme="hidrelay")
     transport = _open_board(options.get("serial"), options.get("path"))
     try:
-        return HostFlash(RelayLamp(transport, bench.clock, channel=options.get("channel", 1)), bench.clock)
+        lamp = RelayLamp(transport, bench.clock, channel=options.get("channel", 1))
+        return HostFlash(lamp, bench.clock, start_guard(transport.address, lamp.dark, bench))
     except BaseException:
         transport.close()
         raise
@@ -132,6 +134,11 @@ class RelayLamp:
             own_schedule=False, watchdog=False, shortest_on_s=0.05, latency_s=0.0075, jitter_s=0.002
         )
 
+    @property
+    def dark(self) -> tuple[str, bytes]:
+        """The report that turns it off, for its guard."""
+        return "set", self._command(_OPEN)
+
     def prepare(self, level: float) -> None:
         """Does nothing: a relay has one level."""
 
@@ -142,8 +149,7 @@ class RelayLamp:
         """Gives the command."""
         self._operations += on != self._on
         self._on = on
-        code = _CLOSE if on else _OPEN
-        self._transport.send_feature(bytes((0, code, self._channel)).ljust(_REPORT_BYTES, b"\0"))
+        self._transport.send_feature(self._command(_CLOSE if on else _OPEN))
 
     def check(self, idle_s: float) -> None:
         """Reads the relay's state now and then."""
@@ -167,6 +173,9 @@ class RelayLamp:
     def close(self) -> None:
         """Lets go of it."""
         self._transport.close()
+
+    def _command(self, code: int) -> bytes:
+        return bytes((0, code, self._channel)).ljust(_REPORT_BYTES, b"\0")
 
     @property
     def _bit(self) -> int:

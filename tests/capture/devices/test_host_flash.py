@@ -230,6 +230,25 @@ def test_a_lamp_that_nobody_closes_is_dark_when_it_is_forgotten(lamp, clock):
     assert lamp.closed
 
 
+def test_its_guard_knows_of_every_light_before_it_goes_on_and_after_it_is_off(lamp, clock):
+    said = []
+
+    class Guard:
+        def lit(self, on):
+            said.append(("guard", on))
+
+        def end(self):
+            said.append(("guard", "end"))
+
+    switch = lamp.switch
+    lamp.switch = lambda on: (switch(on), said.append(("lamp", on)))
+    with HostFlash(lamp, clock, Guard()) as flash:
+        flash.start(PulseTrain(start_s=101.0, count=1))
+        run_until(flash, clock, 102)
+    one = [("guard", True), ("lamp", True), ("lamp", False), ("guard", False)]
+    assert said == [*one, *one[2:], ("guard", "end")]
+
+
 def test_a_signal_in_the_middle_of_a_call_can_turn_it_off(flash, lamp, clock):
     flash.start(PulseTrain(start_s=101.0, count=5))
     run_until(flash, clock, 101.05)
