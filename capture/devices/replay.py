@@ -203,7 +203,9 @@ class ReplayCamera:
                 f"{self.info.name} has {has[0]} x {has[1]} pixels, not {asked[0]} x {asked[1]}; a recording "
                 "is played as it is."
             )
-        return LockReport(controls=self._reports(profile), warnings=tuple(warnings))
+        reports = self._reports(profile)
+        warnings += [f"{report.name}: {report.note}." for report in reports if report.note]
+        return LockReport(controls=reports, warnings=tuple(warnings))
 
     def _reports(self, profile: CameraProfile) -> tuple[ControlReport, ...]:
         note = "a recording cannot be set"

@@ -132,7 +132,12 @@ class ControlLock:
     @property
     def shut(self) -> bool:
         """Whether the camera says that its privacy shutter is closed."""
-        return bool(self._readable().get("privacy")) if "privacy" in self._controls else False
+        if "privacy" not in self._controls:
+            return False
+        try:
+            return self._controls.get("privacy") == 1
+        except StalledError:
+            return False
 
     def set_exposure(self, exposure_s: float) -> float:
         """Tries an exposure without holding it; what the camera says it has."""

@@ -133,6 +133,7 @@ def test_what_cannot_be_set_is_reported_as_such(folder: Path) -> None:
     assert (fps.requested, fps.read_back, fps.note) == (60, 30.0, "a recording cannot be set")
     assert any("64 x 48" in warning and "640 x 480" in warning for warning in report.warnings)
     assert any("no times" in warning for warning in report.warnings)
+    assert "exposure_s: a recording cannot be set." in report.warnings
     assert camera.check() == ()
     assert camera.restore() == ()
 
