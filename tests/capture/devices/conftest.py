@@ -2,6 +2,9 @@
 
 import pytest
 
+# Before they are imported: so that a failed assertion of theirs says what was compared.
+pytest.register_assert_rewrite("flash_contract", "camera_contract")
+
 
 @pytest.fixture(scope="session")
 def firmware_directory(tmp_path_factory):
