@@ -1,8 +1,8 @@
 """LibRaw, through rawpy: a file open in it, and its demosaicing of samples that are ours.
 
 Demosaicing is LibRaw's PPG for Bayer mosaics (Lin, "Pixel grouping", 2003) and its own for others. With noise
-PPG is half a decibel below AHD and one below DHT, but takes two fifths and a fourteenth of their time, and what
-a clipped sample spoils round it is small and known (benchmarks/results/raw_demosaic.json).
+PPG is half a decibel below AHD and one below DHT, but takes two fifths and a fourteenth of their time, and
+what a clipped sample spoils round it is small and known (benchmarks/results/raw_demosaic.json).
 """
 
 from __future__ import annotations
