@@ -16,6 +16,7 @@ from capture.devices.camera import (
     LockReport,
     StreamFormat,
 )
+from capture.devices.pixel_formats import frame_bytes
 from capture.devices.v4l2.choice import Choice, choose_mode, stream_format
 from capture.devices.v4l2.controls import Controls
 from capture.devices.v4l2.kernel import Kernel
@@ -61,6 +62,7 @@ class V4l2Camera:
         self._format: StreamFormat | None = None
         self._stamps = Stamps(None)
         self._first: RawFrame | None = None
+        self._whole = 0
 
     @property
     def info(self) -> CameraInfo:
@@ -121,7 +123,7 @@ class V4l2Camera:
             sequence=raw.sequence,
             data=raw.data,
             arrival_s=raw.arrival_s,
-            damaged=raw.damaged,
+            damaged=raw.damaged or len(raw.data) < self._whole,
             stamp_estimated=estimated,
         )
 
@@ -202,6 +204,7 @@ class V4l2Camera:
                 f"{self._format.pixel_format}; ask for a pixel format by name."
             )
         self._stamps = Stamps(1 / fps if fps else None)
+        self._whole = frame_bytes(self._format) or 0
         self._stream.start()
 
     def _next_for_lock(self) -> CapturedFrame:
