@@ -66,11 +66,10 @@ def run_soak(soak: Soak, *, scheduled: bool, config: TaggingConfig, report_every
             gc.collect()
             memory.append((count, _resident_mb()))
         if report_every and count % report_every == 0:
+            passed_s = round(time.process_time() - started_s)
             print(
-                count,
-                round(time.process_time() - started_s),
-                dict(counts),
-                f"{_resident_mb():.0f} MB",
+                f"{count} frames, {passed_s} s, {_resident_mb():.0f} MB, {dict(counts)}",
+                wrong[-3:],
                 flush=True,
             )
     result = tagger.finish()
@@ -79,12 +78,12 @@ def run_soak(soak: Soak, *, scheduled: bool, config: TaggingConfig, report_every
     return {
         "soak": asdict(soak),
         "scheduled": scheduled,
-        "risk": config.risk,
+        "config": asdict(config),
         "frames": count,
         "frames_without_tag": len(truth),
         "pulses": len(there),
         "pulses_found": result.pulses,
-        **{name: counts[name] for name in ("lit", "lit_found", "partial", "partial_found", "unlit", "unlit_found")},
+        **{name: counts[name] for kind in ("lit", "partial", "unlit") for name in (kind, kind + "_found")},
         "false_lit": sum(item["tag"] == 1 for item in wrong),
         "false_unlit": sum(item["tag"] == 0 for item in wrong),
         "wrong": wrong[:50],
@@ -156,13 +155,21 @@ def main() -> None:
     parser.add_argument(
         "--without-schedule", action="store_true", help="the flash does not report its pulses"
     )
-    parser.add_argument("--risk", type=float, default=TaggingConfig.risk, help="of the tagger")
+    parser.add_argument(
+        "--exposure-unknown", action="store_true", help="the camera does not tell its exposure"
+    )
+    parser.add_argument("--risk", type=float, default=0.001, help="of the tagger")
     parser.add_argument("--report-every", type=int, default=9000, help="frames between lines of progress")
     args = parser.parse_args()
+    soak = Soak(pulses=args.pulses, seed=args.seed)
     result = run_soak(
-        Soak(pulses=args.pulses, seed=args.seed),
+        soak,
         scheduled=not args.without_schedule,
-        config=TaggingConfig(risk=args.risk),
+        config=TaggingConfig(
+            risk=args.risk,
+            stamp_sigma_s=soak.stamp_s,
+            exposure_s=None if args.exposure_unknown else soak.exposure_s,
+        ),
         report_every=args.report_every,
     )
     for name in (

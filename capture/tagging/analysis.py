@@ -48,6 +48,10 @@ _AGREEMENT, _LEAST_AGREEMENT = 0.25, 0.1
 # Light weaker than this share of a flash that is known from before, in log gain, is not that flash.
 _LEAST_KNOWN_GAIN = 0.3
 _PATTERN_BLOCKS = 8
+# Frames farther apart than this many usual intervals have others missing between them.
+_GAP = 1.5
+# A frame beside lost ones has a trace of light when its score is above so many spreads.
+_TRACE_SPREADS = 2.0
 # A flicker with fewer waves over the rows does not measure the readout.
 _LEAST_WAVES = 0.7
 # Tails of the scores in the confidence of frames far from any pulse: motion's are heavy (Student-t).
@@ -188,14 +192,21 @@ def _find_pulses(
     if flicker is not None and config.readout_s is None and abs(flicker.waves) > _LEAST_WAVES:
         config = replace(config, readout_s=flicker.readout_s)  # the wave over the rows measures it
     edges = edge_range(pts_s, windows, interval_s, config)
-    if known is not None and known.shutter_settled:
-        shutter = known.shutter(config)
+    if known is not None and known.shutter is not None:
+        known.fit_again(gain_prior, interval_s, config)
+        shutter = known.shutter
     else:
         shutter = fit_shutter(data, edges, cycle, gain_prior, interval_s, config)
         if known is not None:
-            known.learn_shutter(shutter)
-            shutter = known.shutter(config)
+            shutter = known.first_shutter(shutter, config)
     labels = label_frames(data, edges, shutter, gain_prior, config, commands)
+    if known is not None:
+        asked_s = np.full(len(windows), np.nan)
+        locked = None if commands is None else commands.partners(labels.on_s)
+        if commands is not None and locked is not None:
+            asked_s = np.where(locked[0] >= 0, commands.times_s[locked[0]], np.nan)
+        sure = np.flatnonzero([not w.weak and w.before is not None and w.after is not None for w in windows])
+        known.learn_pulses(data.take(sure), edges.take(sure), labels.on_s[sure], asked_s[sure], interval_s)
     rhythm = fit_rhythm(0.5 * (labels.on_s + labels.off_s), config)
     common = maps[np.flatnonzero(credible)][strong].sum(axis=0)
     return Found(windows, doubtful, data, labels, shutter, rhythm, common / (np.linalg.norm(common) + 1e-9))
@@ -264,6 +275,8 @@ def _frame_labels(
         for k in range(window.begin, window.end):
             if split.score[k] > 4 * split.spread:
                 tags[k] = FrameTag(None, None, 0.5, ("flash_uncertain",))
+    for k in _beside_gaps(profiles, split, found):
+        tags[k] = FrameTag(None, None, 0.5, ("flash_uncertain",))
     labels = found.labels
     for p, i in zip(*np.nonzero(found.data.frames >= 0), strict=True):
         k = int(found.data.frames[p, i])
@@ -276,6 +289,34 @@ def _frame_labels(
             config=config,
         )
     return tags
+
+
+def _beside_gaps(profiles: FrameProfiles, split: Split, found: Found) -> NDArray[np.int_]:
+    """Frames next to lost ones that may show a trace of a pulse that came while frames were lost.
+
+    Those with a little more light than others; and where a pulse was due and none was found, all of them.
+    """
+    pts_s = profiles.pts_s
+    gap = np.flatnonzero(np.diff(pts_s) > _GAP * profiles.interval_s)
+    beside = np.unique(np.concatenate([gap, gap + 1]))
+    doubtful = split.score[beside] > _TRACE_SPREADS * split.spread
+    length_s = float(np.median(found.labels.off_s - found.labels.on_s))
+    for time_s in missed_times(found):
+        after = pts_s[beside] - time_s
+        doubtful |= (after > -2 * profiles.interval_s) & (after < length_s + 2 * profiles.interval_s)
+    return beside[doubtful]
+
+
+def missed_times(found: Found) -> list[float]:
+    """When the missed pulses were due: between their neighbours, in proportion."""
+    rhythm = found.rhythm
+    if rhythm is None:
+        return []
+    known = rhythm.cycle >= 0
+    times = np.interp(
+        np.array(rhythm.missed, float), rhythm.cycle[known].astype(float), found.labels.on_s[known]
+    )
+    return [float(t) for t in times]
 
 
 def _far_label(score: float, spread: float) -> FrameTag:

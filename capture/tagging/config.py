@@ -23,6 +23,7 @@ class TaggingConfig:
         none_lit: a frame is unlit when no row has more than this.
         risk: a label is given only when the probability that it is wrong, over the uncertain pulse edges,
             is below this; otherwise the frame is called partial.
+        stamp_sigma_s: standard deviation of the frames' time stamps; a label must hold within three of them.
         clip_display: display value from which a pixel counts as clipped; video encoders leave clipped areas
             a few codes below white.
         clipped_share: share of the picture from which a frame is remarked as `clipped`.
@@ -39,6 +40,7 @@ class TaggingConfig:
     full_lit: float = 0.98
     none_lit: float = 0.02
     risk: float = 0.01
+    stamp_sigma_s: float = 0.0
     clip_display: float = 0.98
     clipped_share: float = 0.02
     hopeless_share: float = 0.5

@@ -56,8 +56,8 @@ def find_contradictions(
     exposure_s: float,
     slack_s: float,
     config: TaggingConfig,
-) -> NDArray[np.bool_]:
-    """[K] bool, frames whose tag cannot be reconciled with the schedule.
+) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+    """Frames whose tag cannot be reconciled with the schedule.
 
     A frame called unlit that a pulse lights for sure, or one called lit (or found partial by its light) that
     no pulse can reach. What lies within `slack_s` of an edge contradicts nothing, and neither does what the
@@ -72,10 +72,14 @@ def find_contradictions(
         exposure_s: e.
         slack_s: doubt of an edge.
         config: limits of the labels.
+
+    Returns:
+        [K] bool, and [K] the greatest lit share of a row that the schedule allows, edges taken that much
+        farther apart.
     """
     out = np.zeros(len(pts_s), bool)
     if not len(on_s):
-        return out
+        return out, np.zeros(len(pts_s))
     surely, perhaps = (
         predicted_lit_fraction(
             pts_s, on_s + side, off_s - side, readout_s=readout_s, exposure_s=exposure_s, rows=_ROWS
@@ -88,4 +92,4 @@ def find_contradictions(
         unseen = tag.flash == 0 and surely[k] >= _SURELY_LIT
         uncalled = shows_light and perhaps[k] <= 0.0 and covered[k]
         out[k] = unseen or uncalled
-    return out
+    return out, perhaps

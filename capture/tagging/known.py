@@ -1,28 +1,32 @@
 """What the frames so far have taught of a flash and a camera, for the frames to come.
 
-A camera's shutter does not change while its controls are locked, and a lamp keeps its pattern. Each stretch
-of frames gives readout and exposure anew; together they are known better, and after some there is nothing
-left to learn.
+A camera's shutter does not change while its controls are locked, and a lamp keeps its pattern.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from capture.tagging.bands import BandGains
 from capture.tagging.config import TaggingConfig
-from capture.tagging.shutter_fit import Shutter
+from capture.tagging.edges import EdgeRange
+from capture.tagging.shutter_fit import Shutter, fit_shutter
 
 Floats = NDArray[np.float64]
 
-# Fits of the shutter after which no more are made: when the span is known to this share, and in any case.
-_ENOUGH, _SETTLED, _MOST = 6, 0.004, 24
-# What every fit leaves, however sharp its evidence: the model's share (a lamp that rises, time stamps).
-_LEAST_SIGMA = 0.003
-# A fit farther from the others' middle than this many standard deviations is another peak of the evidence.
-_OUTLIER = 5.0
+# Phases of a pulse's start against the frames that are told apart, and pulses kept of each.
+_PHASES, _EACH = 12, 2
+# Phases from which the shutter is believed, and its deviations, as shares of the span, before and after: what
+# fits of one phase were wrong by, and what the model leaves (a lamp that rises, time stamps).
+_ENOUGH_PHASES, _DOUBT, _LEAST_DOUBT = 6, 0.2, 0.005
+# Of a common factor, which only a known exposure fixes well.
+_LEAST_STRETCH = 0.12
+# Pulses from which a fit is made, and so many times more from which it is made again.
+_LEAST_SAMPLES, _MORE = 8, 1.3
 # Pulses and commands belong together within this: a phone's jank, and an interval of frames.
 _TOLERANCE_S = 0.12
 # Fewer matches than this share of the pulses leave the commands unproved.
@@ -30,15 +34,37 @@ _LEAST_MATCHED = 0.5
 _LEAST_LOCKED = 3
 
 
+@dataclass(frozen=True, eq=False)
+class _Sample:
+    """A pulse that the shutter is fitted to.
+
+    Attributes:
+        data: of this pulse alone.
+        edges: likewise.
+        commanded_s: when it was told to go on; NaN = not known.
+    """
+
+    data: BandGains
+    edges: EdgeRange
+    commanded_s: float
+
+
 class KnownFlash:
-    """Shutter, and the light's pattern over the picture."""
+    """Shutter, and the light's pattern over the picture.
+
+    One clock in step with another shows the same phase of the shutter for minutes, and fits of it can be
+    sharp and wrong. So the shutter is fitted to pulses of as many phases as have come by, and until they are
+    many it is doubted.
+    """
 
     def __init__(self) -> None:
         """Nothing is known."""
         self.pattern: Floats | None = None
         self.map: Floats | None = None
         self.log_gain = 0.0
-        self._fits: list[Shutter] = []
+        self.shutter: Shutter | None = None
+        self._samples: list[list[_Sample]] = [[] for _ in range(_PHASES)]
+        self._fitted = 0
 
     def learn_pattern(self, pattern: Floats, map_: Floats, log_gain: float) -> None:
         """Takes the latest pattern: the camera walks, and what the lamp lights in the picture changes.
@@ -50,49 +76,67 @@ class KnownFlash:
         """
         self.pattern, self.map, self.log_gain = pattern, map_, log_gain
 
-    def learn_shutter(self, fit: Shutter) -> None:
-        """Takes one more fit, independent of the others."""
-        self._fits.append(fit)
-
-    @property
-    def empty(self) -> bool:
-        """Whether no shutter has been fitted yet."""
-        return not self._fits
-
-    @property
-    def shutter_settled(self) -> bool:
-        """Whether further fits would not make the shutter known better."""
-        if len(self._fits) < _ENOUGH:
-            return False
-        return len(self._fits) >= _MOST or self.shutter(TaggingConfig()).stretch_sigma < _SETTLED
-
-    def shutter(self, config: TaggingConfig) -> Shutter:
-        """The mean of the fits in log span and roll, each weighted by its precision, outliers left out.
+    def learn_pulses(
+        self, data: BandGains, edges: EdgeRange, on_s: Floats, commanded_s: Floats, interval_s: float
+    ) -> None:
+        """Keeps pulses of phases that are not known well yet.
 
         Args:
-            config: what is known of the shutter stays as it is.
+            data: of the pulses.
+            edges: search ranges of their edges.
+            on_s: [P] their starts.
+            commanded_s: [P] when they were told to go on; NaN = not known.
+            interval_s: from frame to frame.
         """
-        if len(self._fits) == 1:
-            return self._fits[0]
-        span = np.array([abs(fit.readout_s) + fit.exposure_s for fit in self._fits])
-        log_span, stretch = _mean(np.log(span), np.array([_stretch(fit) for fit in self._fits]))
-        roll, roll_sigma = _mean(
-            np.array([fit.readout_s for fit in self._fits]) / span,
-            np.array([_roll_sigma(fit) for fit in self._fits]),
+        for p in range(len(on_s)):
+            first_s = data.start_s[p, 0]
+            phase = int(_PHASES * (((on_s[p] - first_s) / interval_s) % 1)) % _PHASES
+            if len(self._samples[phase]) < _EACH:
+                one = np.array([p])
+                sample = _Sample(data.take(one), edges.take(one), float(commanded_s[p]))
+                self._samples[phase].append(sample)
+
+    def fit_again(self, gain_prior: Floats, interval_s: float, config: TaggingConfig) -> None:
+        """Fits the shutter to the pulses that are kept, if there are new ones."""
+        samples = [sample for phase in self._samples for sample in phase]
+        if len(samples) < max(_LEAST_SAMPLES, _MORE * self._fitted):
+            return
+        self._fitted = len(samples)
+        fit = fit_shutter(
+            _joined([sample.data for sample in samples]),
+            EdgeRange(
+                *(
+                    np.concatenate([getattr(sample.edges, name) for sample in samples])
+                    for name in ("on_low", "on_high", "off_low", "off_high")
+                )
+            ),
+            np.full(len(samples), -1),
+            gain_prior,
+            interval_s,
+            config,
+            np.array([sample.commanded_s for sample in samples]),
         )
-        total = float(np.exp(log_span))
-        readout_s, exposure_s = roll * total, (1 - abs(roll)) * total
-        known = config.readout_s is not None or config.exposure_s is not None
-        return Shutter(
-            readout_s=readout_s if config.readout_s is None else config.readout_s,
-            exposure_s=exposure_s if config.exposure_s is None else config.exposure_s,
-            readout_sigma_s=float(np.hypot(stretch * readout_s, roll_sigma * total))
-            if config.readout_s is None
-            else 0.0,
-            exposure_sigma_s=float(np.hypot(stretch * exposure_s, roll_sigma * total))
-            if config.exposure_s is None
-            else 0.0,
-            stretch_sigma=0.0 if known else stretch,
+        self.shutter = self._doubted(fit, config)
+
+    def first_shutter(self, fit: Shutter, config: TaggingConfig) -> Shutter:
+        """The shutter of the first frames, fitted to them alone; doubted, as their phases may all be one."""
+        self.shutter = self._doubted(fit, config)
+        return self.shutter
+
+    def _doubted(self, fit: Shutter, config: TaggingConfig) -> Shutter:
+        """The fit with the deviations that it has by the phases seen."""
+        span = abs(fit.readout_s) + fit.exposure_s
+        phases = sum(bool(phase) for phase in self._samples)
+        doubt = _DOUBT if phases < _ENOUGH_PHASES else _LEAST_DOUBT
+        free = config.readout_s is None and config.exposure_s is None
+        stretch = max(fit.stretch_sigma, doubt, _LEAST_STRETCH) if free else fit.stretch_sigma
+        readout = doubt * span if config.readout_s is None and not free else 0.0
+        return replace(
+            fit,
+            stretch_sigma=stretch,
+            readout_doubt_s=readout,
+            readout_sigma_s=max(fit.readout_sigma_s, readout, stretch * abs(fit.readout_s) if free else 0.0),
+            exposure_sigma_s=max(fit.exposure_sigma_s, stretch * fit.exposure_s if free else 0.0),
         )
 
 
@@ -163,26 +207,17 @@ def _nearest(times: Floats, t: Floats) -> NDArray[np.int_]:
     return right - (t - times[right - 1] < times[right] - t)
 
 
-def _stretch(fit: Shutter) -> float:
-    """Standard deviation of the log span; of a fit that knows one of the two, by the other."""
-    span = abs(fit.readout_s) + fit.exposure_s
-    return fit.stretch_sigma or float(np.hypot(fit.readout_sigma_s, fit.exposure_sigma_s)) / span
+def _joined(parts: list[BandGains]) -> BandGains:
+    """The data of several pulses, padded to the longest."""
+    longest = max(part.start_s.shape[1] for part in parts)
 
+    def padded(values: NDArray[Any], fill: float) -> NDArray[Any]:
+        room = [(0, 0), (0, longest - values.shape[1]), *([(0, 0)] * (values.ndim - 2))]
+        return np.pad(values, room, constant_values=fill)
 
-def _roll_sigma(fit: Shutter) -> float:
-    """Standard deviation of readout over span, as `fit_shutter` combined it."""
-    span = abs(fit.readout_s) + fit.exposure_s
-    return float(np.sqrt(max(fit.exposure_sigma_s**2 - (_stretch(fit) * fit.exposure_s) ** 2, 0.0))) / span
-
-
-def _mean(values: Floats, sigma: Floats) -> tuple[float, float]:
-    """Weighted mean without outliers, and its standard deviation by the larger of formal and seen scatter."""
-    sigma = np.hypot(sigma, _LEAST_SIGMA)
-    order = np.argsort(values)
-    total = np.cumsum(1 / sigma[order] ** 2)
-    middle = values[order][np.searchsorted(total, 0.5 * total[-1])]
-    kept = np.abs(values - middle) <= _OUTLIER * sigma
-    weight = kept / sigma**2
-    mean = float(weight @ values / weight.sum())
-    scatter = float(weight @ np.square(values - mean)) / max(int(kept.sum()) - 1, 1)
-    return mean, float(np.sqrt(max(1.0, scatter) / weight.sum()))
+    return BandGains(
+        start_s=np.concatenate([padded(part.start_s, 0.0) for part in parts]),
+        gain=np.concatenate([padded(part.gain, 0.0) for part in parts]),
+        weight=np.concatenate([padded(part.weight, 0.0) for part in parts]),
+        frames=np.concatenate([padded(part.frames, -1) for part in parts]),
+    )

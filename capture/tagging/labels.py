@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +12,7 @@ from capture.tagging.bands import BandGains
 from capture.tagging.config import TaggingConfig
 from capture.tagging.edges import EdgeCurve, EdgeRange, Edges, calibrated, find_edges
 from capture.tagging.known import Commands
-from capture.tagging.schedule import fit_rhythm, neighbours_log_prior
+from capture.tagging.schedule import Hypothesis, fit_rhythm, neighbours_log_prior
 from capture.tagging.shutter import lit_share, share_after, sharp_limits
 from capture.tagging.shutter_fit import Shutter
 
@@ -20,6 +21,8 @@ Floats = NDArray[np.float64]
 # Gauss-Hermite points and weights of a normal distribution, exact to the fifth power.
 _STRETCHES = ((-(3**0.5), 1 / 6), (0.0, 2 / 3), (3**0.5, 1 / 6))
 _STEP_S = 5e-4
+# Errors of time stamps that a label must survive, in standard deviations.
+_STAMP_SIGMAS = 3.0
 # Bands for the mean lit share of a frame: it is nearly linear in them.
 _COARSE_BANDS = 4
 
@@ -64,14 +67,18 @@ def label_frames(
     """Label probabilities, averaged over the unknown common stretch of readout and exposure."""
     middle = find_edges(data, edges, shutter.readout_s, shutter.exposure_s, gain_prior, _STEP_S)
     data = calibrated(data, middle, shutter.readout_s, shutter.exposure_s)
-    points = _STRETCHES if shutter.stretch_sigma > 0 else ((0.0, 1.0),)
+    points = ((0.0, 1.0),) if shutter.certain else _STRETCHES
+    likely: _Hypotheses | None = None
+    slack_s = _STAMP_SIGMAS * config.stamp_sigma_s + shutter.small_doubt_s
     shape = data.start_s.shape
     full, none, lit = np.zeros(shape), np.zeros(shape), np.zeros(shape)
     for sigmas, weight in points:
         readout_s, exposure_s = shutter.stretched(sigmas)
         found = find_edges(data, edges, readout_s, exposure_s, gain_prior, _STEP_S)
-        on_p, off_p = _posterior(found, config, commands)
-        f, n, a = _probabilities(data.start_s, found, on_p, off_p, readout_s, exposure_s, config)
+        on_p, off_p, ways = _posterior(found, config, commands, likely)
+        if commands is not None:  # the lamp's lateness, which is about the same for a shutter nearly the same
+            likely = ways
+        f, n, a = _probabilities(data.start_s, found, on_p, off_p, readout_s, exposure_s, slack_s, config)
         full, none, lit = full + weight * f, none + weight * n, lit + weight * a
         if sigmas == 0.0:
             middle, middle_p = found, (on_p, off_p)
@@ -82,27 +89,32 @@ def label_frames(
     return EdgeLabels(full, none, lit, excess, excess_sigma, on_s, off_s, on_sigma_s, off_sigma_s, gain)
 
 
-def _posterior(found: Edges, config: TaggingConfig, commands: Commands | None) -> tuple[Floats, Floats]:
-    """Probabilities on both edges' grids, with what the other pulses' rhythm or lateness says."""
-    locked = None if commands is None else commands.partners(found.on.best_s)
+_Hypotheses = tuple[Sequence[Hypothesis], Sequence[Hypothesis]]
+
+
+def _posterior(
+    found: Edges, config: TaggingConfig, commands: Commands | None, likely: _Hypotheses | None
+) -> tuple[Floats, Floats, _Hypotheses]:
+    """Probabilities on both edges' grids, with what the other pulses' rhythm or lateness says, and the ways
+    in which they may be regular: looked for where none are given.
+    """
+    on, off = found.on, found.off
+    locked = None if commands is None else commands.partners(on.best_s)
     if commands is not None and locked is not None:
-        partner, _ = locked
-        # Times are moved so that the commands are a period apart: what is left of a rhythm is lateness.
+        cycle, _ = locked
         apart = np.diff(commands.times_s)
         period_s = float(np.median(apart)) if len(apart) else config.longest_period_s
-        moved = np.where(partner >= 0, commands.times_s[partner] - partner * period_s, 0.0)[:, None]
-        on, off = (EdgeCurve(curve.time_s - moved, curve.log) for curve in (found.on, found.off))
-        return (
-            found.on.probability(neighbours_log_prior(on, partner, period_s)),
-            found.off.probability(neighbours_log_prior(off, partner, period_s)),
-        )
-    rhythm = fit_rhythm(0.5 * (found.on.best_s + found.off.best_s), config)
-    if rhythm is None:
-        return found.on.probability(), found.off.probability()
-    return (
-        found.on.probability(neighbours_log_prior(found.on, rhythm.cycle, rhythm.period_s)),
-        found.off.probability(neighbours_log_prior(found.off, rhythm.cycle, rhythm.period_s)),
-    )
+        # Times are moved so that the commands are a period apart: what is left of a rhythm is lateness.
+        moved = np.where(cycle >= 0, commands.times_s[cycle] - cycle * period_s, 0.0)[:, None]
+        on, off = EdgeCurve(on.time_s - moved, on.log), EdgeCurve(off.time_s - moved, off.log)
+    else:
+        rhythm = fit_rhythm(0.5 * (on.best_s + off.best_s), config)
+        if rhythm is None:
+            return on.probability(), off.probability(), ((), ())
+        cycle, period_s = rhythm.cycle, rhythm.period_s
+    on_prior, on_likely = neighbours_log_prior(on, cycle, period_s, likely[0] if likely else None)
+    off_prior, off_likely = neighbours_log_prior(off, cycle, period_s, likely[1] if likely else None)
+    return found.on.probability(on_prior), found.off.probability(off_prior), (on_likely, off_likely)
 
 
 def _probabilities(
@@ -112,14 +124,17 @@ def _probabilities(
     off_p: Floats,
     readout_s: float,
     exposure_s: float,
+    slack: float,
     config: TaggingConfig,
 ) -> tuple[Floats, Floats, Floats]:
     """[P, n] probability of fully lit, of unlit, and expected lit share."""
     on_full, off_full, off_none, on_none = sharp_limits(
         readout_s, exposure_s, config.full_lit, config.none_lit
     )
-    full = _until(found.on, on_p, start_s + on_full) * (1 - _until(found.off, off_p, start_s + off_full))
-    none = _until(found.off, off_p, start_s + off_none) + 1 - _until(found.on, on_p, start_s + on_none)
+    full = _until(found.on, on_p, start_s + on_full - slack)
+    full = full * (1 - _until(found.off, off_p, start_s + off_full + slack))
+    none = _until(found.off, off_p, start_s + off_none - slack)
+    none = none + 1 - _until(found.on, on_p, start_s + on_none + slack)
     lit = 0.0
     for curve, p, sign in ((found.on, on_p, 1), (found.off, off_p, -1)):
         share = share_after(start_s[:, None], curve.time_s[..., None], readout_s, exposure_s, _COARSE_BANDS)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +12,8 @@ from capture.frame_record import FrameRecord
 from capture.session import Session
 from capture.tagging.config import TaggingConfig
 from capture.tagging.profiles import ProfileAccumulator
-from capture.tagging.result import FlashPrior, FrameTag, TagResult
+from capture.tagging.records import with_tag
+from capture.tagging.result import FlashPrior, TagResult
 from capture.tagging.stills import tag_stills
 from capture.tagging.tagger import tag
 
@@ -79,16 +79,6 @@ def tag_session(session: Session, *, config: TaggingConfig | None = None) -> lis
         )
     profiles = accumulator.profiles()
     tags = tag(profiles, config=config).frames if video else tag_stills(profiles, config).frames
-    tagged = [_with_tag(record, frame) for record, frame in zip(kept, tags, strict=True)]
+    tagged = [with_tag(record, frame) for record, frame in zip(kept, tags, strict=True)]
     known = {old.index: new if old.flash is None else old for old, new in zip(kept, tagged, strict=True)}
     return [known.get(record.index, record) for record in session.frames]
-
-
-def _with_tag(record: FrameRecord, frame: FrameTag) -> FrameRecord:
-    return replace(
-        record,
-        flash=frame.flash,
-        lit_fraction=frame.lit_fraction,
-        confidence=frame.confidence,
-        reasons=tuple(dict.fromkeys((*record.reasons, *frame.reasons))),
-    )

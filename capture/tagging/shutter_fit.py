@@ -40,6 +40,8 @@ _IRREGULARITIES = np.geomspace(5e-5, 0.05, 16)
 _SHORTEST_EXPOSURE_S = 1e-4
 # Distances from the peak at which the evidence's fall is measured, in log span and in roll.
 _REACHES = (0.01, 0.03, 0.1, 0.3)
+# Doubt of the readout that moves the limits of labels by no more than edges are known.
+_SMALL_S = 3e-4
 # Grid steps of the edge search: several to an exposure, down to what the refinement resolves.
 _EDGE_STEPS_S = (5e-4, 1e-3)
 
@@ -54,6 +56,7 @@ class Shutter:
         readout_sigma_s: standard deviation of the readout.
         exposure_sigma_s: standard deviation of the exposure.
         stretch_sigma: standard deviation of a common factor on both, which the pictures alone do not fix.
+        readout_doubt_s: how far the readout alone may be off beyond that; labels must hold all the same.
     """
 
     readout_s: float
@@ -61,11 +64,22 @@ class Shutter:
     readout_sigma_s: float
     exposure_sigma_s: float
     stretch_sigma: float
+    readout_doubt_s: float = 0.0
+
+    @property
+    def certain(self) -> bool:
+        """Whether labels need not be averaged over what is not known."""
+        return self.stretch_sigma <= 0 and self.readout_doubt_s <= _SMALL_S
+
+    @property
+    def small_doubt_s(self) -> float:
+        """A doubt of the readout that is an edge's slack rather than another shutter."""
+        return self.readout_doubt_s if self.readout_doubt_s <= _SMALL_S else 0.0
 
     def stretched(self, sigmas: float) -> tuple[float, float]:
-        """(readout, exposure) so many standard deviations along the common factor."""
+        """(readout, exposure) so many standard deviations along the common factor, and along the doubt."""
         factor = float(np.exp(sigmas * self.stretch_sigma))
-        return self.readout_s * factor, self.exposure_s * factor
+        return self.readout_s * factor + sigmas * self.readout_doubt_s, self.exposure_s * factor
 
 
 def fit_shutter(
@@ -75,6 +89,7 @@ def fit_shutter(
     gain_prior: Floats,
     interval_s: float,
     config: TaggingConfig,
+    commanded_s: Floats | None = None,
 ) -> Shutter:
     """Fit readout and exposure.
 
@@ -85,14 +100,17 @@ def fit_shutter(
         gain_prior: [B] usual gain of fully lit bands.
         interval_s: from frame to frame.
         config: known exposure and readout.
+        commanded_s: [P] when each pulse was told to go on, by a clock that runs with the frames', NaN = not
+            known; None = none is.
     """
     data, gain_prior = data.merged(_MERGE), gain_prior.reshape(-1, _MERGE).mean(axis=1)
     most = _thin(len(data.start_s), _MOST)
-    problem = _Problem(data.take(most), edges.take(most), cycle[most], gain_prior, interval_s, config)
-    few = _thin(len(most), _FEW)
-    coarse = _Problem(
-        problem.data.take(few), problem.edges.take(few), problem.cycle[few], gain_prior, interval_s, config
+    asked_s = np.full(len(cycle), np.nan) if commanded_s is None else commanded_s
+    problem = _Problem(
+        data.take(most), edges.take(most), cycle[most], asked_s[most], gain_prior, interval_s, config
     )
+    few = _thin(len(most), _FEW)
+    coarse = problem.take(few)
     starts = [(np.log(span), roll) for span in _SPANS for roll in _ROLLS]
     best = max(starts, key=coarse.evidence)
     best = coarse.climb(best, 25)
@@ -129,12 +147,25 @@ class _Problem:
         data: BandGains,
         edges: EdgeRange,
         cycle: NDArray[np.int_],
+        commanded_s: Floats,
         gain_prior: Floats,
         interval_s: float,
         config: TaggingConfig,
     ):
-        self.data, self.edges, self.cycle = data, edges, cycle
+        self.data, self.edges, self.cycle, self._commanded_s = data, edges, cycle, commanded_s
         self._gain_prior, self._interval_s, self._config = gain_prior, interval_s, config
+
+    def take(self, index: NDArray[np.int_]) -> _Problem:
+        """The evidence of some pulses."""
+        return _Problem(
+            self.data.take(index),
+            self.edges.take(index),
+            self.cycle[index],
+            self._commanded_s[index],
+            self._gain_prior,
+            self._interval_s,
+            self._config,
+        )
 
     def times(self, x: tuple[float, float]) -> tuple[float, float]:
         """(readout, exposure) in seconds, with what the configuration knows."""
@@ -162,6 +193,10 @@ class _Problem:
         off_s, off_variance = found.off.moments()
         ones = np.ones(len(on_s))
         value += _regularity(off_s - on_s, on_variance + off_variance, [ones])
+        asked = np.flatnonzero(np.isfinite(self._commanded_s))
+        if len(asked) > 3:  # a lamp is late by the same time, or nearly
+            late_s = on_s[asked] - self._commanded_s[asked]
+            value += _regularity(late_s - late_s[0], on_variance[asked], [np.ones(len(asked))])
         known = np.flatnonzero(self.cycle >= 0)
         if len(known) > 3:
             t, variance, n = on_s[known] - on_s[known[0]], on_variance[known], self.cycle[known].astype(float)

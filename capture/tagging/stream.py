@@ -385,8 +385,10 @@ class StreamTagger:
         _, jitter_s = self._table.lateness()
         slack_s = max(_SLACK_S, _SLACK_SIGMAS * (jitter_s or 0.0))
         shutter = next((p.analysis.found.shutter for p in parts if p.analysis is not None), None)
-        shutter = shutter or self._known.shutter(self._config)
-        wrong = find_contradictions(
+        shutter = shutter or self._known.shutter
+        if shutter is None:
+            return tags
+        wrong, possible = find_contradictions(
             pts_s,
             tags,
             on_s,
@@ -405,22 +407,29 @@ class StreamTagger:
         shown = predicted_lit_fraction(
             pts_s, on_s, on_s + length_s, readout_s=shutter.readout_s, exposure_s=shutter.exposure_s, rows=4
         ).max(axis=1)
+        traces = np.zeros(len(pts_s), bool)  # of a pulse that came while frames were lost, perhaps
         for time_s in on_s[inside]:
-            near = (pts_s >= time_s) & (pts_s < time_s + length_s)
-            if np.any(shown[near] > 0) and not np.any(np.abs(seen_s - time_s) < 0.5 * length_s + slack_s):
+            if np.any(np.abs(seen_s - time_s) < 0.5 * length_s + slack_s):
+                continue
+            if np.any(shown[(pts_s >= time_s) & (pts_s < time_s + length_s)] > 0):
                 self._counts.happened("unseen", [float(time_s)])
+            traces |= (np.abs(pts_s - time_s) < 2 * length_s) & (possible > 0)
         covered = [
             pulse.t_on_s
             for (pulse, _), late_s in zip(pulses, late, strict=True)
             if not np.isfinite(late_s) and on_s[0] < pulse.t_on_s < on_s[-1]
         ]
         self._counts.happened("unscheduled", covered)
-        return [
-            replace(tag, flash=None, confidence=0.5, reasons=(*tag.reasons, "contradiction"))
-            if contradicts
-            else tag
-            for tag, contradicts in zip(tags, mine, strict=True)
-        ]
+        out = list(tags)
+        for k in range(stretch.begin, cut):
+            if mine[k]:
+                out[k] = replace(
+                    tags[k], flash=None, confidence=0.5, reasons=(*tags[k].reasons, "contradiction")
+                )
+            elif traces[k] and tags[k].flash == 0:
+                reasons = (*tags[k].reasons, "flash_uncertain")
+                out[k] = replace(tags[k], flash=None, lit_fraction=None, confidence=0.5, reasons=reasons)
+        return out
 
     def _count(self, stretch: _Stretch, cut: int, tags: list[FrameTag], parts: list[_Part]) -> None:
         """What the summary needs of a stretch's own frames."""
@@ -464,7 +473,7 @@ class StreamTagger:
         rhythm = table.rhythm(self._config)
         droop = table.droop()
         latency_s, latency_jitter_s = table.lateness()
-        fit = None if whole is not None or self._known.empty else self._known.shutter(self._config)
+        fit = None if whole is not None else self._known.shutter
         if fit is not None and not shutter_is_known(fit, self._interval_s):
             fit = None
         shutter = whole or fit

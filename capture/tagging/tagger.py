@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capture.errors import TaggingError
-from capture.tagging.analysis import Analysis, Found, analyse
+from capture.tagging.analysis import Analysis, Found, analyse, missed_times
 from capture.tagging.config import TaggingConfig
 from capture.tagging.prior import check_prior
 from capture.tagging.profiles import FrameProfiles
@@ -107,7 +107,7 @@ def _warnings(analysis: Analysis) -> list[str]:
         out.append(f"{len(found.windows)} pulses are too few to tell a period.")
     else:
         if found.rhythm.missed:
-            times = ", ".join(f"{t:.2f}" for t in _missed_times(found)[:5])
+            times = ", ".join(f"{t:.2f}" for t in missed_times(found)[:5])
             out.append(
                 f"{len(found.rhythm.missed)} pulses did not come (at {times} s); those frames are without "
                 "flash."
@@ -129,18 +129,6 @@ def _warnings(analysis: Analysis) -> list[str]:
             f"of {1e3 / flicker.frequency_hz:.1f} ms, or use daylight."
         )
     return out + analysis.drift.warnings()
-
-
-def _missed_times(found: Found) -> list[float]:
-    """When the missed pulses were due: between their neighbours, in proportion."""
-    rhythm = found.rhythm
-    if rhythm is None:
-        return []
-    known = rhythm.cycle >= 0
-    times = np.interp(
-        np.array(rhythm.missed, float), rhythm.cycle[known].astype(float), found.labels.on_s[known]
-    )
-    return [float(t) for t in times]
 
 
 def result_of(
@@ -171,7 +159,7 @@ def result_of(
         period_s=rhythm.period_s if rhythm is not None else None,
         period_sigma_s=rhythm.period_sigma_s if rhythm is not None else None,
         jitter_s=rhythm.jitter_s if rhythm is not None else None,
-        missed_s=tuple(_missed_times(found)),
+        missed_s=tuple(missed_times(found)),
         readout_s=shutter.readout_s if known else None,
         readout_sigma_s=shutter.readout_sigma_s if known else None,
         exposure_s=shutter.exposure_s if known else None,
