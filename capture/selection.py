@@ -7,13 +7,15 @@ most of them; the choice is made after every frame has been looked at and tagged
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+
+from capture.frame_record import EXCLUDING_REASONS, FrameRecord
 
 # Share of the median sharpness around it below which a frame counts as blurred. The measure falls with the
 # square of the contrast of fine detail: motion over three to four pixels of the measured plane gets there.
@@ -76,6 +78,47 @@ def select_frames(
         unlit = _spread(unlit, unlit_share)
         lit = _spread(lit, max_frames - len(unlit))
     return frozenset(lit) | frozenset(unlit)
+
+
+def select_records(
+    records: Sequence[FrameRecord],
+    picture: Callable[[FrameRecord], str | None],
+    *,
+    rate_hz: float = 6.0,
+    max_frames: int | None = None,
+    posed: Collection[int] = (),
+) -> list[FrameRecord]:
+    """The records with the pictures of those to keep, and with the reason where one is not kept.
+
+    Args:
+        records: tagged, in order of time.
+        picture: the file of a frame that is kept.
+        rate_hz: see `select_frames`.
+        max_frames: see `select_frames`.
+        posed: indices of frames whose pose is known.
+    """
+    candidates = [
+        Candidate(
+            pts_s=record.pts_s or 0.0,
+            flash=None if "unreadable" in record.reasons else record.flash,
+            sharpness=record.sharpness or 0.0,
+            sound=EXCLUDING_REASONS.isdisjoint(record.reasons),
+            posed=record.index in posed,
+        )
+        for record in records
+    ]
+    kept = select_frames(candidates, rate_hz, max_frames)
+    blurred = find_blurred(candidates, kept)
+    selected = []
+    for position, record in enumerate(records):
+        if position in kept:
+            remark = ("blurred",) if position in blurred else ()
+            selected.append(replace(record, file=picture(record), reasons=(*record.reasons, *remark)))
+        elif EXCLUDING_REASONS.isdisjoint(record.reasons):
+            selected.append(replace(record, file=None, reasons=(*record.reasons, "not_selected")))
+        else:
+            selected.append(replace(record, file=None))
+    return selected
 
 
 def find_blurred(candidates: Sequence[Candidate], positions: Collection[int]) -> frozenset[int]:

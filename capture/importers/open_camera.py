@@ -24,9 +24,10 @@ from capture.importers.options import ImportOptions, Progress, no_progress
 from capture.importers.recording_parts import Recording, open_recording
 from capture.importers.sidecar_evidence import Evidence, FrameTimes, gather_evidence, tie_frame_times
 from capture.importers.video_frames import write_frames
-from capture.importers.video_records import blank_records, select_records, tag_records
+from capture.importers.video_records import blank_records, tag_records
 from capture.importers.video_scene import VideoScene, match_poses, read_video_scene, save_video_scene
 from capture.importers.video_survey import survey_recording
+from capture.selection import select_records
 from capture.session import Session
 from capture.tagging import TagResult
 from capture.transfer import canonical_transfer
@@ -81,7 +82,13 @@ def import_videos(
     progress("tagging", 0.0)
     records = blank_records(recording, survey, times, evidence, posed)
     records, tags = tag_records(records, survey, times, options, warnings)
-    records = select_records(records, posed, options)
+    records = select_records(
+        records,
+        lambda record: f"frames/{record.index:06d}.png",
+        rate_hz=options.kept_rate_hz,
+        max_frames=options.max_frames,
+        posed=posed,
+    )
     progress("tagging", 1.0)
 
     session = resumed or Session.create(

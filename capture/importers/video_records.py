@@ -1,4 +1,4 @@
-"""What becomes of each frame of a video: its flash, whether it is kept, and why not."""
+"""What is known of each frame of a video before its picture is written, and its flash."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ import numpy as np
 
 from capture.cameras import PosedFrame
 from capture.errors import TaggingError
+from capture.frame_record import FrameRecord
 from capture.importers.flash_list import read_flash_list
 from capture.importers.options import ImportOptions
 from capture.importers.recording_parts import Recording
 from capture.importers.sidecar_evidence import Evidence, FrameTimes
 from capture.importers.video_survey import Survey
-from capture.selection import Candidate, find_blurred, select_frames
-from capture.session import EXCLUDING_REASONS, FrameRecord
 from capture.tagging import FlashPrior, TagResult, tag
+from capture.tagging.records import with_tag
 
 _GAP = 1.6  # of the usual frame interval, from which frames are missing before a frame
 
@@ -78,13 +78,7 @@ def tag_records(
     tagged = list(records)
     sound = [record.index for record in records if "unreadable" not in record.reasons]
     for index, frame in zip(sound, result.frames, strict=True):
-        tagged[index] = replace(
-            records[index],
-            flash=frame.flash,
-            lit_fraction=frame.lit_fraction,
-            confidence=frame.confidence,
-            reasons=tuple(dict.fromkeys((*records[index].reasons, *frame.reasons))),
-        )
+        tagged[index] = with_tag(records[index], frame)
     return tagged, result
 
 
@@ -98,32 +92,3 @@ def _tag_with_prior(survey: Survey, prior: FlashPrior | None, warnings: list[str
         result = tag(survey.profiles)
         warnings.append(f"The sidecar was left out: {contradiction}")
         return result
-
-
-def select_records(
-    records: Sequence[FrameRecord], posed: Mapping[int, PosedFrame], options: ImportOptions
-) -> list[FrameRecord]:
-    """The records with the names of the pictures to keep, and with the reason where a frame is not kept."""
-    candidates = [
-        Candidate(
-            pts_s=record.pts_s or 0.0,
-            flash=None if "unreadable" in record.reasons else record.flash,
-            sharpness=record.sharpness or 0.0,
-            sound=EXCLUDING_REASONS.isdisjoint(record.reasons),
-            posed=record.index in posed,
-        )
-        for record in records
-    ]
-    kept = select_frames(candidates, options.kept_rate_hz, options.max_frames)
-    blurred = find_blurred(candidates, kept)
-    selected = []
-    for record in records:
-        if record.index in kept:
-            remark = ("blurred",) if record.index in blurred else ()
-            file = f"frames/{record.index:06d}.png"
-            selected.append(replace(record, file=file, reasons=(*record.reasons, *remark)))
-        elif EXCLUDING_REASONS.isdisjoint(record.reasons):
-            selected.append(replace(record, reasons=(*record.reasons, "not_selected")))
-        else:
-            selected.append(record)
-    return selected

@@ -32,18 +32,14 @@ class Desk:
     rig: Rig
     folder: Path
 
-    def capture(
-        self, camera="sim:coarse", flash="sim:jitter_ms=0.3", *, watch=None, resume=False, out=None, **settings
-    ):
+    def capture(self, camera="sim:coarse", flash="sim:", *, watch=None, resume=False, out=None, **settings):
         settings = {"duration_s": 6.0} | settings
         config = CaptureConfig(**settings)
         bench = open_bench(camera, flash, config.duration_s)
         self.bench = bench
         with open_flash(flash, bench) as lamp, open_camera(camera, bench) as eye:
             self.camera, self.flash = eye, lamp
-            return run_capture(
-                eye, lamp, bench, out or self.folder / "S", config, watch=watch, resume=resume
-            )
+            return run_capture(eye, lamp, bench, out or self.folder / "S", config, watch=watch, resume=resume)
 
     def truth(self, session):
         """By frame index: 1, 0 or None for partial, from the lamp's real light and the sensor's rows."""

@@ -223,7 +223,10 @@ def test_an_interrupted_capture_is_gone_on_with(desk):
     times = np.array([record.pts_s for record in session.frames])
     assert np.all(np.diff(times) > 0)
     new = [record for record in session.frames if record.index not in before]
-    assert sum(record.flash == 1 for record in new) >= 6
+    lit = [record for record in new if record.flash == 1]
+    assert len(lit) >= 6
+    assert all(record.file is not None for record in lit)
+    assert all((session.path / record.file).is_file() for record in session.frames if record.file)
     with pytest.raises(SessionError, match="is complete"):
         desk.capture(resume=True)
 
@@ -233,8 +236,10 @@ def test_a_capture_that_was_killed_is_readable_and_is_tagged_when_it_is_gone_on_
     out = tmp_path / "killed"
     command = "from capture.cli import main; main()"
     process = subprocess.Popen(
-        [sys.executable, "-c", command, "--camera", "sim:coarse;unposed", "--flash", "sim:"]
-        + ["--out", str(out), "--duration", "60", "--quiet"],
+        [
+            *(sys.executable, "-c", command, "--camera", "sim:coarse;unposed", "--flash", "sim:"),
+            *("--out", str(out), "--duration", "60", "--quiet"),
+        ],
         stderr=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
     )
