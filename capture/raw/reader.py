@@ -107,6 +107,9 @@ class RawFile:
 
         Args:
             white_balance: multipliers of R, G, B, at least 1 each; the same for all pictures to be compared.
+
+        Raises:
+            ImageError: LibRaw cannot interpolate it.
         """
         balance = np.asarray(white_balance, np.float32)
         if balance.shape != (3,) or not (np.isfinite(balance) & (balance >= 1)).all():
@@ -117,7 +120,10 @@ class RawFile:
         elif self.cell.size == 1:
             radiance, clipped = np.repeat(samples[..., None], 3, axis=2), self.at_clip
         else:
-            radiance, missing = demosaic(self.path, samples, self.cell, self.corner)
+            try:
+                radiance, missing = demosaic(self.path, samples, self.cell, self.corner)
+            except ImageError as cause:
+                raise ImageError(f"{self.path} cannot be developed: {cause}.") from cause
             clipped = touched_by(self.at_clip, self.cell) | missing
         self.after.apply(radiance)
         return RawPicture(radiance, clipped, self.facts)

@@ -254,6 +254,20 @@ def test_an_x_trans_mosaic_goes_through_libraw(make, tmp_path):
     assert picture.clipped.sum() < 300
 
 
+def test_an_x_trans_mosaic_that_is_too_small_for_libraw_is_one_sentence(make, tmp_path):
+    with pytest.raises(ImageError, match=r"picture\.dng cannot be developed: LibRaw says"):
+        read(tmp_path, make.dng(np.full((36, 36), 900), pattern="XTRANS"))
+
+
+def test_a_sensor_without_colours_gives_grey(make, tmp_path):
+    codes = np.random.default_rng(9).integers(100, 4000, (32, 40)).astype(np.uint16)
+    data = make.dng(codes, black=64.0, white=WHITE, extra={262: (3, [34892])})
+    picture = read(tmp_path, data, white_balance=(2.0, 1.0, 1.6))
+    expected = np.repeat(((codes - 64.0) / (WHITE - 64))[..., None], 3, axis=2)
+    np.testing.assert_allclose(picture.radiance, expected, atol=STEP)
+    assert picture.facts.cfa == ""
+
+
 def test_without_a_stated_white_level_a_pile_of_samples_at_the_top_is_the_clip(make, tmp_path):
     rng = np.random.default_rng(7)
     stored = rng.integers(200, 15000, (60, 60)).astype(np.uint16)
