@@ -7,6 +7,8 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 
+import numpy as np
+
 from capture.controller.looking import LookedFrame, Watch
 from capture.devices.flash import FlashEdge
 from capture.live.monitor import LiveMonitor
@@ -67,7 +69,7 @@ class Display:
                 self._period_s,
                 self._duration_s,
             )
-        label = self._monitor.add(picture, frame.pts_s, frame.sequence)
+        self._monitor.add(picture, frame.pts_s, frame.sequence)
         now_s = time.monotonic()
         if now_s < self._shown_s + 1.0 / _SHOWN_HZ:
             return
@@ -76,7 +78,8 @@ class Display:
         if self._panel is not None:
             self._panel.show(state)
         if self._server is not None:
-            self._server.update(state, frame.rgb if label == "unlit" else None)
+            turns = frame.stream_format.rotation_deg // 90
+            self._server.update(state, np.ascontiguousarray(np.rot90(frame.rgb, -turns)))
 
     def edges(self, edges: Sequence[FlashEdge]) -> None:
         """See `Watch.edges`."""
