@@ -202,8 +202,10 @@ class ControlLock:
             if asked is not None:
                 self._warn(f"{name} cannot be set to {asked:g}: the camera has no control for it.")
             return
-        if value is None:
-            return
+        if value is None:  # the device does not tell what its automatic has found
+            if name in LEFT_ALONE:
+                return
+            value = from_device(name, control.default)
         found = asked is None
         if name == "exposure_s" and found:
             value = without_banding(value, profile.mains_hz)

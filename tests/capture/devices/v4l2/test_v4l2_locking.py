@@ -1,5 +1,8 @@
 """A lock against the faults of real cameras and kernels, each on the fake driver."""
 
+import errno
+import os
+
 import pytest
 
 from capture.devices.bench import Bench, VirtualClock
@@ -308,3 +311,37 @@ def test_a_camera_that_gives_no_frames_times_out(make):
     with pytest.raises(CameraTimeoutError, match=r"no frame within 0.7 s"):
         camera.read(0.7)
     assert clock.now_s() - before_s == pytest.approx(0.7, abs=0.002)  # and one pause
+
+
+class Mute:
+    """A kernel whose driver takes values and tells none."""
+
+    def __init__(self, kernel):
+        self._kernel = kernel
+
+    def __getattr__(self, name):
+        return getattr(self._kernel, name)
+
+    def ioctl(self, descriptor, request, argument):
+        if request == v4l2.G_EXT_CTRLS:
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        self._kernel.ioctl(descriptor, request, argument)
+
+
+@pytest.mark.parametrize("exposure_s", [0.01, None])
+def test_a_driver_that_tells_no_values_is_locked_by_the_light(exposure_s):
+    quirks, _ = parse("width=64;height=48")
+    bench = Bench(VirtualClock())
+    kernel = FakeKernel(quirks, bench)
+    with V4l2Camera(Mute(kernel), FAKE_PATH, "fake-v4l2:", "fake-v4l2", bench.clock) as camera:
+        report = camera.lock(CameraProfile(width=64, height=48, exposure_s=exposure_s))
+        exposure = control(report, "exposure_s")
+        assert exposure.read_back is None
+        assert exposure.verified is True
+        assert "does not tell" in exposure.note
+        assert device(kernel, v4l2.CID_EXPOSURE_AUTO) == v4l2.EXPOSURE_MANUAL
+        if exposure_s is None:
+            assert brightness(camera) == pytest.approx(0.18, rel=0.2)  # the automatic's
+        else:
+            assert device(kernel, v4l2.CID_EXPOSURE_ABSOLUTE) == 100
+        assert camera.check() == ()
