@@ -51,7 +51,7 @@ class SerialLine:
         self.details: dict[str, Any] = {"port": path} | usb_details(path)
         self._description = f"{url} ({path})" if path != url else url
         self._is_tty = "://" not in url or url.lower().startswith(("hwgrep://", "alt://"))
-        self._selects = os.name == "posix" and hasattr(self._port, "fileno")
+        self._selects = os.name == "posix" and _has_file(self._port)
         if self._is_tty:
             self.details |= _hurry(self._port, Path(path).name, self._description)
 
@@ -130,6 +130,14 @@ def _open(url: str) -> Any:
     except (OSError, ValueError) as error:
         raise FlashError(_why_not(url, error)) from error
     return port
+
+
+def _has_file(port: Any) -> bool:
+    """Whether the system can wait for it: not for rfc2217:// and loop://."""
+    try:
+        return bool(port.fileno() >= 0)
+    except (OSError, ValueError):  # io.UnsupportedOperation is both
+        return False
 
 
 def _why_not(url: str, error: OSError | ValueError) -> str:

@@ -8,9 +8,11 @@ from flash_doubles import StepLine, SteppedCore, SteppedProgram, build
 
 from capture.devices.bench import Bench
 from capture.devices.firmware_flash.flash import open_firmware_flash
+from capture.devices.firmware_flash.link import refusal
 from capture.devices.flash import PulseTrain
 from capture.errors import FlashError, FlashGoneError, FlashResetError
-from firmware_protocol import Hello, encode
+from firmware_protocol import Err, Hello, Stop, encode
+from firmware_protocol.messages import ErrorCode
 
 
 class SteppedRig(FlashRig):
@@ -215,6 +217,25 @@ def test_a_train_that_is_too_near_is_refused_with_how_near_it_may_be(rig):
         pytest.raises(FlashError, match=r"0\.5 ms ahead; .* at least [1-9]\.\d ms before"),
     ):
         flash.start(PulseTrain(start_s=rig.clock.now_s() + 0.0005))
+
+
+def test_a_train_that_a_bad_line_makes_late_is_refused_and_lights_nothing(rig):
+    """The first TRAIN is lost; its repeat comes 100 ms later, and the flash was to begin after 50."""
+    with rig.open() as flash:
+        write, lost = rig.line.write, []
+        rig.line.write = lambda data: write(data) if lost or len(data) < 20 else lost.append(data)
+        with pytest.raises(FlashError, match=r"was told too late: .*; start later"):
+            flash.start(PulseTrain(start_s=rig.clock.now_s() + 0.05))
+        assert lost
+        assert rig.watch(flash, 0.5) == []
+        assert flash.link_report()["repeats"] == 1
+
+
+@pytest.mark.parametrize("code", [*ErrorCode, 77])
+def test_every_error_of_the_device_is_one_sentence_that_names_it(code):
+    text = str(refusal(Err(code, 1, 3), Stop(), "/dev/ttyUSB0"))
+    assert text.startswith("/dev/ttyUSB0 ")
+    assert text.endswith(".")
 
 
 def test_what_is_not_the_flash_is_named_with_what_it_said(core):

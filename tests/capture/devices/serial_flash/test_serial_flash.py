@@ -11,6 +11,7 @@ import subprocess
 import sys
 import threading
 import time
+from contextlib import suppress
 from random import Random
 
 import pytest
@@ -48,6 +49,13 @@ class DamagingLine(SerialLine):
 
     def read(self, timeout_s):
         return damage(super().read(timeout_s), self.random, 0.01)
+
+
+class HurriedClock(MonotonicClock):
+    """Ten seconds in one."""
+
+    def now_s(self):
+        return 10 * super().now_s()
 
 
 class LiveRig(FlashRig):
@@ -98,13 +106,15 @@ def served(double):
     def serve():
         line = os.open(double.path, os.O_RDWR | os.O_NOCTTY)
         connection, _ = listener.accept()
-        with connection:
+        with connection, suppress(ConnectionError):  # the host may leave in the middle of a word
             while not done.is_set():
                 for ready in select.select([line, connection], [], [], 0.05)[0]:
-                    if ready is connection:
-                        os.write(line, connection.recv(4096))
-                    else:
+                    if ready is not connection:
                         connection.sendall(os.read(line, 4096))
+                    elif data := connection.recv(4096):
+                        os.write(line, data)
+                    else:
+                        done.set()
         os.close(line)
 
     thread = threading.Thread(target=serve, daemon=True)
@@ -233,6 +243,12 @@ def test_a_host_that_is_killed_leaves_the_lamp_dark(double):
     lamp = double.lamp()[before:]
     assert not lamp[-1][1]
     assert lamp[-1][0] < killed_s + WATCHDOG_S
+
+
+def test_a_line_that_the_system_cannot_wait_for_is_polled():
+    """loop:// stands for rfc2217:// too; what it says is its own echo."""
+    with pytest.raises(FlashError, match="only echoes"):
+        open_flash("loop://", Bench(HurriedClock()))
 
 
 def test_a_port_that_is_in_use_or_missing_says_so(double):
