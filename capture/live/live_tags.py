@@ -28,10 +28,11 @@ _CLIPPED_CODE = 249
 _REFERENCES, _FEWEST = 4, 3  # unlit frames: more are a longer walk back
 _LEAST_GAIN = 0.08  # natural logarithm; weaker flashes than 8 % of the room are not shown
 _NOISE_FACTOR = 5.0
-_FULL, _NONE = 0.72, 0.22  # shares of a full flash's gain from which a band is lit, up to which it is not
+# Shares of a full flash's gain from which a band is lit (of this pulse's, of earlier ones'), and is not.
+_FULL, _ROUGHLY_FULL, _NONE = 0.8, 0.55, 0.22
 _TELLING = 0.3  # of the strongest band's gain: weaker ones see the wall, and say little
 _MOVED = 0.5
-_FADES = 0.98  # of the remembered full flash, at each frame with some
+_FADES = 0.94  # of the remembered full flash, at each frame with some
 _LONGEST_LIT_S = 0.6  # no flash lasts so long: the light of the room has changed
 _DARKER_FRAMES = 3  # darker than the reference: that was lit
 _PULSE_GAP_S = 0.15  # between the lit frames of one pulse
@@ -55,6 +56,7 @@ class LiveTagger:
         self._unlit: deque[NDArray[np.float32]] = deque(maxlen=_REFERENCES)
         self._full: NDArray[np.float32] | None = None
         self._noise = 0.02
+        self._pulse: NDArray[np.float32] | None = None
         self._darker = 0
         self._lit_since_s: float | None = None
         self._last_lit_s = -1e9
@@ -103,15 +105,20 @@ class LiveTagger:
         if told.sum() < _BANDS // 4:
             return LIT if float(np.median(profile)) > least else PARTIAL
         shares = profile[told] / full[told]
-        if float(np.percentile(shares, 8)) >= _FULL:
-            return LIT
-        return UNLIT if float(np.percentile(shares, 92)) <= _NONE else PARTIAL
+        if float(np.percentile(shares, 92)) <= _NONE:
+            return UNLIT
+        # The pulse's own frames before say it exactly; the pulses before, of another view, roughly.
+        of_pulse = 1.0 if self._pulse is None else _least_share(profile[told], self._pulse[told])
+        self._pulse = profile if self._pulse is None else np.maximum(self._pulse, profile)
+        return (
+            LIT if _least_share(profile[told], full[told]) >= _ROUGHLY_FULL and of_pulse >= _FULL else PARTIAL
+        )
 
     def _remember(
         self, label: str, profile: NDArray[np.float32], logs: NDArray[np.float32], stamp_s: float
     ) -> str:
         if label == UNLIT:
-            self._lit_since_s = None
+            self._lit_since_s = self._pulse = None
             spread = 1.4826 * float(np.median(np.abs(profile)))
             self._noise = _KEPT * self._noise + (1 - _KEPT) * spread
             darker = float(np.median(profile)) < -max(_LEAST_GAIN, _NOISE_FACTOR * self._noise)
@@ -136,3 +143,8 @@ class LiveTagger:
         self._unlit.clear()
         self._darker = 0
         self._lit_since_s = None
+
+
+def _least_share(profile: NDArray[np.float32], full: NDArray[np.float32]) -> float:
+    """Nearly the least share of a full flash's gain among bands."""
+    return float(np.percentile(profile / np.maximum(full, 1e-3), 8))

@@ -210,8 +210,9 @@ def _gauge(coverage: Coverage) -> Text:
         text.append("\n")
     words = "the walk cannot be told" if coverage.span_deg is None else f"around {span(coverage)}"
     text.append(words.center(_GAUGE_COLUMNS), "cyan" if coverage.span_deg is not None else "grey62")
-    if coverage.elevation_span_deg is not None:
-        text.append("\n" + f"up and down {coverage.elevation_span_deg:.0f}°".center(_GAUGE_COLUMNS), "grey62")
+    height = coverage.elevation_span_deg
+    words = " " if height is None else f"up and down {height:.0f}°"
+    text.append("\n" + words.center(_GAUGE_COLUMNS), "grey62")
     return text
 
 
