@@ -60,12 +60,9 @@ class LiveTagger:
         self._darker = 0
         self._lit_since_s: float | None = None
         self._last_lit_s = -1e9
-        self._pulses_s: list[float] = []
-
-    @property
-    def pulses_s(self) -> tuple[float, ...]:
-        """When each flash was first seen."""
-        return tuple(self._pulses_s)
+        #: Flashes that were seen, and when the last of them began; None = none yet.
+        self.pulses = 0
+        self.last_pulse_s: float | None = None
 
     def add(self, luma: NDArray[np.uint8], stamp_s: float) -> str:
         """The label of a frame: luma [h, w] in sensor rows, and its stamp, increasing."""
@@ -134,7 +131,8 @@ class LiveTagger:
             self._forget()
             return UNKNOWN
         if stamp_s - self._last_lit_s > _PULSE_GAP_S:
-            self._pulses_s.append(stamp_s)
+            self.pulses += 1
+            self.last_pulse_s = stamp_s
         self._last_lit_s = stamp_s
         return label
 

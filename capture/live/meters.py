@@ -36,11 +36,13 @@ class Light:
 class LightMeter:
     """Measures pictures of one size."""
 
-    def __init__(self, width: int, height: int) -> None:
+    def __init__(self, width: int, height: int, sideways: bool = False) -> None:
+        """Starts; in pictures that lie `sideways` the head does too."""
         rows, columns = np.mgrid[0:height:_STRIDE, 0:width:_STRIDE]
         side = min(width, height)
         across, along = (columns - width / 2) / side, (rows - height / 2) / side
-        inside = (across / _SUBJECT[0]) ** 2 + (along / _SUBJECT[1]) ** 2 < 1
+        half_across, half_along = _SUBJECT[::-1] if sideways else _SUBJECT
+        inside = (across / half_across) ** 2 + (along / half_along) ** 2 < 1
         self._subject = np.where(inside, 255, 0).astype(np.uint8)
         self._pixels = inside.size
         self._subject_pixels = int(np.count_nonzero(inside))

@@ -46,6 +46,7 @@ class LiveMonitor:
         duration_s: float,
         *,
         focal_px: float | None = None,
+        rotation_deg: int = 0,
     ) -> None:
         """Begins.
 
@@ -58,16 +59,20 @@ class LiveMonitor:
             duration_s: planned length of the recording.
             focal_px: of those pictures; None = a typical one is taken, and the angles of the walk are as
                 wrong as it is (a lens of 70 degrees instead of 58: by a fifth).
+            rotation_deg: clockwise turn that shows the pictures upright: 0, 90, 180, 270.
         """
         for name, value in {"width": width, "height": height, "fps": fps, "duration_s": duration_s}.items():
             if not (math.isfinite(value) and value > 0):
                 raise ValueError(f"{name} is {value}; it must be positive")
+        if rotation_deg not in (0, 90, 180, 270):
+            raise ValueError(f"rotation_deg is {rotation_deg}; it must be 0, 90, 180 or 270")
+        self._turns = rotation_deg // 90
         self._size = (height, width)
         self._period_s, self._duration_s = train_period_s, duration_s
         self._scale = min(1.0, SHORT_SIDE / min(width, height))
         self._small = (round(width * self._scale), round(height * self._scale))
         self._focal_px = (focal_px or TYPICAL_FOCAL * max(width, height)) * self._scale
-        self._meter, self._sharpness = LightMeter(width, height), SharpnessGauge()
+        self._meter, self._sharpness = LightMeter(width, height, self._turns % 2 == 1), SharpnessGauge()
         self._tagger, self._tracker = LiveTagger(transfer), FlowTracker()
         self._gauge, self._motion, self._adviser = CoverageGauge(), HeadMotion(), Adviser()
         self._labels: deque[str] = deque(maxlen=max(8, round(_STRIP_S * fps)))
@@ -139,7 +144,7 @@ class LiveMonitor:
         if self._fineness < _USELESS and stamp_s - self._followed_s < _PATIENCE_S:
             return
         self._followed_s = stamp_s
-        flow = self._tracker.add(small, stamp_s)
+        flow = self._tracker.add(np.ascontiguousarray(np.rot90(small, -self._turns)), stamp_s)
         if flow is None:
             return
         turn = surroundings_turn(flow, self._focal_px)
@@ -173,7 +178,7 @@ class LiveMonitor:
             clipped_subject=max(unlit.clipped_subject, recent.clipped_subject if recent else 0.0),
             dark=unlit.dark,
             labels=tuple(self._labels),
-            pulses_seen=len(self._tagger.pulses_s),
+            pulses_seen=self._tagger.pulses,
             pulses_expected=self._pulses_expected(elapsed_s),
             coverage=self._gauge.coverage(),
             motion=self._motion.restlessness(),
@@ -191,14 +196,14 @@ class LiveMonitor:
         return None if self._period_s is None else math.floor(elapsed_s / self._period_s)
 
     def _advice(self, state: LiveState) -> str:
-        pulses = self._tagger.pulses_s
-        first_s = self._first_s or 0.0
+        last_pulse_s = self._tagger.last_pulse_s
+        since_s = (self._first_s or 0.0) if last_pulse_s is None else last_pulse_s
         walked = [azimuth for _, azimuth in self._walk]
         over_s = self._walk[-1][0] - self._walk[0][0] if len(self._walk) > 1 else 0.0
         settled = over_s > 0.8 * _WALK_S
         return self._adviser.choose(
             state,
-            without_flash_s=self._last_s - (pulses[-1] if pulses else first_s),
+            without_flash_s=self._last_s - since_s,
             period_s=self._period_s,
             blurred=float(np.mean(self._blurs)) if self._blurs else 0.0,
             walk_deg_s=(max(walked) - min(walked)) / over_s if settled else math.inf,
