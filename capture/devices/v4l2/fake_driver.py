@@ -19,7 +19,7 @@ from capture.devices.v4l2.fake_quirks import Quirks
 from capture.devices.v4l2.fake_sensor import FakeSensor
 
 #: The only node there is.
-FAKE_PATH = "/dev/video0"
+FAKE_PATH = "/dev/fake-video0"
 _READOUT_S = 0.020
 #: From the end of the readout to the buffer, for the bus.
 _TRANSFER_S = 0.003
