@@ -108,5 +108,5 @@ def test_the_edges_file_has_the_lamp_by_the_clock_of_the_system(live, edges_file
     assert before_ns < on_ns < off_ns < after_ns
     # The file's edges and the firmware's own ticks are the same two moments, but for their roundings.
     assert (off_ns - on_ns) * 1e-9 == pytest.approx((off.tick - on.tick) / tick_hz, abs=8e-6)
-    assert sum(what == "t" for _, what in lines) > 10
+    assert sum(what == "t" for _, what in lines) > 2  # hundreds, but on a machine that is held up
     assert lines[-1][1] == "t"

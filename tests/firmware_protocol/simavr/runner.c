@@ -40,7 +40,7 @@ static avr_t *avr;
 static int line_fd, lit, latch[2], room = 1, trace;
 static unsigned long received, sent;
 static uint8_t waiting[1 << 16];
-static size_t waiting_from, waiting_to;
+static size_t waiting_from, waiting_ready, waiting_to; /* what came after `ready` is not met yet */
 static uint16_t lowest_stack = 0xFFFF;
 static avr_flashaddr_t hung_at;
 static uint8_t hung_over[2];
@@ -158,10 +158,10 @@ static int read_line(void)
 static void feed_line(void)
 {
     avr_irq_t *input = avr_io_getirq(avr, AVR_IOCTL_UART_GETIRQ('0'), UART_IRQ_INPUT);
-    while (room && waiting_from < waiting_to)
+    while (room && waiting_from < waiting_ready)
         avr_raise_irq(input, waiting[waiting_from++]);
     if (waiting_from == waiting_to)
-        waiting_from = waiting_to = 0;
+        waiting_from = waiting_ready = waiting_to = 0;
 }
 
 static void run_until(avr_cycle_count_t end)
@@ -205,6 +205,7 @@ static void obey(const char *command)
         while (received < total)
             if (!read_line() && poll(&wait, 1, 2000) == 0)
                 exit(fprintf(stderr, "%lu bytes promised, %lu came\n", total, received));
+        waiting_ready = waiting_to;
         run_until(avr->cycle + us * (avr->frequency / 1000000));
         printf("ok %llu %lu %u\n", (unsigned long long)avr->cycle, sent, lowest_stack);
     } else if (!strncmp(command, "reset", 5)) {
@@ -241,9 +242,10 @@ static void live(void)
         struct timespec pause = {0, avr->cycle - heard < avr->frequency / 50 ? 100000 : 1000000};
         char command[128];
         ppoll(waits, 2, &pause, 0);
-        catch_up();
         if (read_line())
             heard = avr->cycle;
+        catch_up();
+        waiting_ready = waiting_to;
         if (waits[1].revents) {
             ssize_t count = read(0, command, sizeof command - 1);
             if (count <= 0)

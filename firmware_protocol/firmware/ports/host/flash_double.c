@@ -66,16 +66,18 @@ static void write_line(uint8_t byte)
         sent++;
 }
 
-/* Returns how many bytes. */
+/* What has come, for `take_line`. Returns how many bytes. */
+static uint8_t come[4096];
 static size_t read_line(void)
 {
-    uint8_t bytes[4096];
-    ssize_t count = read(line_fd, bytes, sizeof bytes);
-    if (count <= 0)
-        return 0;
-    host_receive(bytes, (size_t)count);
-    received += (size_t)count;
-    return (size_t)count;
+    ssize_t count = read(line_fd, come, sizeof come);
+    return count > 0 ? (size_t)count : 0;
+}
+
+static void take_line(size_t count)
+{
+    host_receive(come, count);
+    received += count;
 }
 
 static void reset(void)
@@ -118,11 +120,14 @@ static void take_promised(unsigned long total)
 {
     struct pollfd wait = {0, POLLIN, 0};
     wait.fd = line_fd;
-    while (received < total)
-        if (!read_line() && poll(&wait, 1, 2000) == 0) {
+    while (received < total) {
+        size_t count = read_line();
+        take_line(count);
+        if (!count && poll(&wait, 1, 2000) == 0) {
             fprintf(stderr, "%lu bytes promised, %lu came\n", total, received);
             exit(1);
         }
+    }
 }
 
 static void obey(const char *command)
@@ -159,11 +164,13 @@ static void live(void)
     for (;;) {
         struct pollfd waits[2] = {{0, POLLIN, 0}, {0, POLLIN, 0}};
         int until_edge_ms = (int)((host_next_edge(port_now() + TICK_HZ / 200) - port_now()) / 1000);
+        size_t heard;
         waits[0].fd = line_fd;
         poll(waits, 2, until_edge_ms);
+        /* read first: no byte is met before it was written */
+        heard = waits[0].revents & POLLIN ? read_line() : 0;
         catch_up();
-        if (waits[0].revents & POLLIN)
-            read_line();
+        take_line(heard);
         if (waits[1].revents) {
             /* commands are typed or written whole, one at a time */
             ssize_t count = read(0, command, sizeof command - 1);
