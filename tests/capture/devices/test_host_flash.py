@@ -222,10 +222,11 @@ def test_a_lamp_that_nobody_closes_is_dark_when_it_is_forgotten(lamp, clock):
     flash.start(PulseTrain(start_s=101.0, count=5))
     run_until(flash, clock, 101.05)
     assert lamp.on
-    gone = weakref.ref(flash)
+    gone, closed = weakref.ref(flash), flash._closed
     del flash
     gc.collect()
     assert gone() is None
+    assert closed.is_set()  # a thread in the middle of its work lights nothing any more
     assert not lamp.on
     assert lamp.closed
 

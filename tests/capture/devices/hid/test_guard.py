@@ -63,31 +63,42 @@ def test_it_acts_when_the_light_is_not_taken_back_in_time():
     assert put_out == [1]
 
 
-def test_a_host_that_is_killed_while_the_light_is_on_has_it_put_out(tmp_path):
+@pytest.fixture
+def lit_host(tmp_path):
+    """Starts a host with its light on: (process, what its guard wrote so far)."""
     lamp = tmp_path / "lamp"
-    # A limit that the test does not live to see: it is the death that is noticed.
-    command = [sys.executable, "-c", HOST, WATCH, str(lamp), "60"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as host:
-        assert host.stdout.readline() == "lit\n"
-        host.send_signal(signal.SIGKILL)
-        host.wait(10)
-    deadline_s = time.monotonic() + 10
-    while not lamp.exists() and time.monotonic() < deadline_s:
-        time.sleep(0.01)
-    assert lamp.read_text() == "out\n"
+    hosts = []
 
+    def start(limit_s):
+        command = [sys.executable, "-c", HOST, WATCH, str(lamp), str(limit_s)]
+        hosts.append(subprocess.Popen(command, stdout=subprocess.PIPE, text=True))
+        assert hosts[-1].stdout.readline() == "lit\n"
+        return hosts[-1], lambda: lamp.read_text() if lamp.exists() else ""
 
-def test_a_host_that_stands_still_while_the_light_is_on_has_it_put_out(tmp_path):
-    lamp = tmp_path / "lamp"
-    command = [sys.executable, "-c", HOST, WATCH, str(lamp), "0.3"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as host:
-        assert host.stdout.readline() == "lit\n"
-        host.send_signal(signal.SIGSTOP)
-        deadline_s = time.monotonic() + 10
-        while not lamp.exists() and time.monotonic() < deadline_s:
-            time.sleep(0.01)
-        assert lamp.read_text() == "out\n"
+    yield start
+    for host in hosts:
         host.kill()
+        host.wait(10)
+        host.stdout.close()
+
+
+def text_of(written):
+    deadline_s = time.monotonic() + 10
+    while not written() and time.monotonic() < deadline_s:
+        time.sleep(0.01)
+    return written()
+
+
+def test_a_host_that_is_killed_while_the_light_is_on_has_it_put_out(lit_host):
+    host, written = lit_host(limit_s=60)  # the test does not live to see it: it is the death that is noticed
+    host.send_signal(signal.SIGKILL)
+    assert text_of(written) == "out\n"
+
+
+def test_a_host_that_stands_still_while_the_light_is_on_has_it_put_out(lit_host):
+    host, written = lit_host(limit_s=0.3)
+    host.send_signal(signal.SIGSTOP)
+    assert text_of(written) == "out\n"
 
 
 def test_a_host_that_says_farewell_is_left_alone(tmp_path):
