@@ -23,7 +23,6 @@ from firmware_protocol import (
     Decoder,
     Err,
     Event,
-    Fault,
     Hello,
     Message,
     Packet,
@@ -80,7 +79,6 @@ class FirmwareLink:
         self.restarted = False
         self.heartbeat = False
         self.decoder = Decoder()
-        self.faults: deque[Fault] = deque(maxlen=8)
         self._clock = clock
         self._seq = 0
         self._pings: dict[int, tuple[Ping, float]] = {}
@@ -189,8 +187,6 @@ class FirmwareLink:
         for item in self.decoder.feed(data):
             if isinstance(item, Packet):
                 self._hear(item, arrived_s)
-            else:
-                self.faults.append(item)
         if self.heartbeat and not self._waiting and arrived_s - self._heard_s > SILENT_S:
             raise FlashGoneError(
                 f"{self.description} has been silent for {arrived_s - self._heard_s:.1f} s; its light has "
