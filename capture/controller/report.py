@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 from typing import Any
 
-from capture.devices.camera import CameraDevice, CapturedFrame, LockReport
+from capture.devices.camera import CapturedFrame, LockReport
 from capture.devices.flash import FlashDevice
 from capture.tagging.stream_summary import StreamResult
 
@@ -18,6 +18,7 @@ class Counts:
         frames: That came.
         lost: That the camera's sequence says are missing.
         damaged: That are no pictures.
+        stamps_repaired: Whose stamp could not be.
         edges: That the flash reported.
         waits: How often the disk was too slow.
         wall_s: From the first to the last.
@@ -27,6 +28,7 @@ class Counts:
     frames: int = 0
     lost: int = 0
     damaged: int = 0
+    stamps_repaired: int = 0
     edges: int = 0
     waits: int = 0
     wall_s: float = 0.0
@@ -71,19 +73,14 @@ def pulse_warning(on_s: float, lock: LockReport, fps: float) -> list[str]:
 
 
 def capture_report(
-    camera: CameraDevice,
-    flash: FlashDevice,
-    counts: Counts,
-    stamps_repaired: int,
-    result: StreamResult | None,
-    stopped: str | None,
+    flash: FlashDevice, counts: Counts, result: StreamResult | None, stopped: str | None
 ) -> dict[str, Any]:
     """The entry "capture" of session.json."""
     return {
         "frames": counts.frames,
         "lost": counts.lost,
         "damaged": counts.damaged,
-        "stamps_repaired": stamps_repaired,
+        "stamps_repaired": counts.stamps_repaired,
         "flash_edges": counts.edges,
         "waits_for_disk": counts.waits,
         "wall_s": round(counts.wall_s, 3),

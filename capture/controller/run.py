@@ -179,9 +179,7 @@ class _Capture:
         for sentence in self._left_behind():
             self._warn(sentence)
         session.update_info(
-            capture=capture_report(
-                self._camera, self._flash, self._counts, self._axis.repaired, result, stopped or signal
-            ),
+            capture=capture_report(self._flash, self._counts, result, stopped or signal),
             warnings=[*session.info.get("warnings", []), *self.warnings],
         )
         whole = stopped is None and signal is None and result is not None and result.refused is None
@@ -251,6 +249,7 @@ class _Capture:
         lost = self._counts.frame(frame)
         remarks = ["dropped_before"] if lost else []
         if frame.stamp_estimated or not sound_stamp:
+            self._counts.stamps_repaired += 1
             remarks.append("stamp_repaired")
         looked = None if frame.damaged else self._looker.look(index, pts_s, frame)
         if looked is None:

@@ -20,11 +20,7 @@ _LEAST_STEP_S = 1e-4
 
 
 class TimeAxis:
-    """Times of frames and of the flash.
-
-    Attributes:
-        repaired: How many stamps were not later than the one before and were set by the frame rate instead.
-    """
+    """Times of frames and of the flash."""
 
     def __init__(self, clock: str, interval_s: float, begin_s: float = 0.0) -> None:
         """Of a camera whose `CameraInfo.clock` this is.
@@ -40,7 +36,6 @@ class TimeAxis:
         self._last_s = float("-inf")
         self._last_sequence = 0
         self._lags: deque[tuple[float, float]] = deque()  # (arrival, arrival - stamp), lags rising
-        self.repaired = 0
 
     def pts_s(self, frame: CapturedFrame) -> tuple[float, bool]:
         """The frame's time, later than the one before in any case, and whether its stamp could be used."""
@@ -51,7 +46,6 @@ class TimeAxis:
         pts_s = frame.stamp_s - self._zero_s
         sound = pts_s > self._last_s + _LEAST_STEP_S
         if not sound:
-            self.repaired += 1
             pts_s = self._last_s + self._interval_s * max(1, frame.sequence - self._last_sequence)
         elif self._own:
             self._remember_lag(frame)

@@ -1,10 +1,14 @@
-"""What the tests of file readers share: damage to a file's content, and a place to put it."""
+"""What tests share: damage to a file's content, a place to put it, and one simulated rig for all."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from hypothesis import strategies as st
+
+from capture.sim import RigConfig
+from capture.sim.rig import Rig
 
 Damage = Callable[[bytes], st.SearchStrategy[bytes]]
 
@@ -32,3 +36,15 @@ def damage() -> Damage:
 def scratch(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder for files that every example overwrites."""
     return tmp_path_factory.mktemp("scratch")
+
+
+@pytest.fixture(scope="session")
+def built_rig():
+    return Rig.build(RigConfig.small())
+
+
+@pytest.fixture
+def one_rig(built_rig, monkeypatch):
+    """They differ in path, rate and sensor, which nothing that takes long depends on."""
+    monkeypatch.setattr(Rig, "build", lambda config: replace(built_rig, config=config))
+    return built_rig

@@ -1,6 +1,6 @@
 """A simulated desk on which a capture takes seconds."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
@@ -8,21 +8,8 @@ import pytest
 from capture.controller.config import CaptureConfig
 from capture.controller.run import run_capture
 from capture.devices.table import open_bench, open_camera, open_flash
-from capture.sim import RigConfig
 from capture.sim.lamp import Pulse, PulseTrain
 from capture.sim.rig import Rig
-
-
-@pytest.fixture(scope="session")
-def built_rig():
-    return Rig.build(RigConfig.small())
-
-
-@pytest.fixture
-def one_rig(built_rig, monkeypatch):
-    """They differ in path, rate and sensor, which nothing that takes long depends on."""
-    monkeypatch.setattr(Rig, "build", lambda config: replace(built_rig, config=config))
-    return built_rig
 
 
 @dataclass

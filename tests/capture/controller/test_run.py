@@ -132,6 +132,34 @@ def test_it_stops_with_a_sentence_everything_kept_and_the_lamp_off(desk, camera,
         assert all(record.flash is None and record.file is not None for record in session.frames)
 
 
+SMALL = "fake-v4l2:width=320;height=240;"
+
+
+def test_lost_damaged_and_wrongly_stamped_frames_are_told_and_tag_nothing_wrongly(desk):
+    outcome = desk.capture(SMALL + "lost_every=13;damaged_every=11;bad_stamp_every=17", keep_all=True)
+    assert outcome.stopped is None
+    report, frames = outcome.session.info["capture"], outcome.session.frames
+    remarks = Counter(reason for record in frames for reason in record.reasons)
+    assert report["lost"] >= 10
+    assert remarks["unreadable"] == report["damaged"] >= 10
+    assert remarks["stamp_repaired"] == report["stamps_repaired"] >= 5
+    assert [record.index for record in frames] == list(range(report["frames"]))
+    assert all(record.flash is None for record in frames if "unreadable" in record.reasons)
+    light = report["light"]
+    assert (light["matched"], light["contradictions"], light["unscheduled"]) == (6, 0, 0)
+
+
+@pytest.mark.parametrize(
+    ("profile", "sentence"), [("unplugged", "plug"), ("broken", ""), ("meddler", "by itself or by another")]
+)
+def test_a_driver_that_fails_in_mid_capture_stops_it(desk, profile, sentence):
+    outcome = desk.capture(SMALL + f"profile={profile}", duration_s=14.0)
+    assert sentence in outcome.stopped
+    assert desk.dark
+    assert outcome.session.status == "interrupted"
+    assert sum(record.flash == 1 for record in outcome.session.frames) >= 8
+
+
 def test_it_stops_when_the_picture_is_white(desk):
     from capture.devices.camera import CameraProfile
 

@@ -32,7 +32,6 @@ def test_a_stamp_that_does_not_advance_is_set_by_the_frame_rate_and_said_so(stam
     pts_s, sound = axis.pts_s(frame(stamp_s, 2))
     assert (pts_s, sound) == (pytest.approx(0.08), False)
     assert axis.pts_s(frame(10.12, 3)) == (pytest.approx(0.12), True)
-    assert axis.repaired == 1
 
 
 def test_the_flash_is_found_on_the_axis_of_a_camera_with_its_own_clock():
