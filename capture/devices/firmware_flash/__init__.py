@@ -4,6 +4,7 @@
     link.py           commands and answers over it: numbers, repeats, heartbeat, resets, counters
     handshake.py      HELLO through boot noise, and who answered instead
     device_clock.py   round trips of PING and PONG -> device clock in host time
+    train_ticks.py    a train in host time -> TRAIN in the device's ticks
     edges.py          EVENT -> edge in host time, numbered within its train
     flash.py          the FlashDevice made of them
 

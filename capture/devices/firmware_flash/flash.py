@@ -18,21 +18,18 @@ from types import TracebackType
 from typing import Any, Self
 
 from capture.devices.bench import Bench, Clock, MonotonicClock
-from capture.devices.firmware_flash.device_clock import DeviceClock
 from capture.devices.firmware_flash.edges import EdgeLog
 from capture.devices.firmware_flash.handshake import shake_hands
 from capture.devices.firmware_flash.link import FirmwareLink
+from capture.devices.firmware_flash.train_ticks import in_ticks
 from capture.devices.firmware_flash.transport import ByteTransport
-from capture.devices.flash import LONGEST_ON_S, FlashCapabilities, FlashEdge, FlashInfo, PulseTrain
+from capture.devices.flash import FlashCapabilities, FlashEdge, FlashInfo, PulseTrain
 from capture.errors import FlashError, FlashGoneError
-from firmware_protocol import Stat, Stop, Train, encode
-from firmware_protocol.limits import FULL_LEVEL, MAX_ON_MS, MIN_PERIOD_US
+from firmware_protocol import Stat, Stop, encode
 from firmware_protocol.messages import Capability, State
 
 log = logging.getLogger(__name__)
 
-#: The firmware takes no train that begins sooner.
-LEAD_S = 1e-3
 #: Shorter flashes are approximate on the ATmega328P.
 SHORTEST_ON_S = 20e-6
 STOP_TRIES = 5
@@ -160,7 +157,11 @@ class FirmwareFlash:
             if self._needs_hello:
                 shake_hands(self._link, after_reset=True)
                 self._needs_hello = False
-            message = self._in_ticks(train)
+            if self._link.hello is None or self._link.clock is None:
+                raise FlashGoneError(f"{self._link.description} is not known; open it again.")
+            message = in_ticks(
+                train, self._link.hello, self._link.clock, self._link.now_s(), self._link.description
+            )
             try:
                 answer = self._link.ask(message)
             except FlashGoneError:
@@ -168,7 +169,7 @@ class FirmwareFlash:
                 raise
             finally:
                 self._collect()
-            if isinstance(answer, Stat) and self._link.hello is not None:
+            if isinstance(answer, Stat):
                 self._log.begin(message, self._link.hello.tick_hz, answer.pulses)
                 self._running = (answer, train.end_s)
 
@@ -330,47 +331,6 @@ class FirmwareFlash:
         finally:
             self._collect()
         return isinstance(answer, Stat) and answer.state in (State.IDLE, State.SAFE) and answer.level == 0
-
-    def _in_ticks(self, train: PulseTrain) -> Train:
-        link = self._link
-        if link.clock is None or link.hello is None:
-            raise FlashGoneError(f"{link.description} is not known; open it again.")
-        level = round(train.level * FULL_LEVEL)
-        if level != FULL_LEVEL and not self.capabilities.dimmable:
-            raise FlashError(f"{link.description} cannot dim its light to {train.level:.2f}; use level 1.")
-        ahead_s = train.start_s - link.now_s()
-        least_s = LEAD_S + min(link.clock.round_trips_s, default=0.0) + 3 * self._sigma_s(train)
-        if ahead_s < least_s:
-            raise FlashError(
-                f"start_s is {ahead_s * 1e3:.1f} ms ahead; {link.description} must be told at least "
-                f"{least_s * 1e3:.1f} ms before the first flash."
-            )
-        rate = _rate(link.clock)
-        return Train(
-            link.hello.boot_nonce,
-            link.clock.fit.device(train.start_s),
-            max(MIN_PERIOD_US, round(train.period_s * rate * 1e6)),
-            min(MAX_ON_MS * 1000, max(1, round(min(train.on_s, LONGEST_ON_S) * rate * 1e6))),
-            train.count,
-            level,
-        )
-
-    def _sigma_s(self, train: PulseTrain) -> float:
-        """How well the device's clock is known when the train begins."""
-        if self._link.clock is None:
-            return 0.0
-        fit = self._link.clock.fit
-        return fit.host_s(fit.device(train.start_s))[1]
-
-
-def _rate(clock: DeviceClock) -> float:
-    """The device's seconds in a second of the host; 1 unless it is known to be something else.
-
-    The first second of round trips tells it to some 50 ppm: a resonator's 0.3 % is seen, a crystal's 20 ppm
-    is not and would only be made worse.
-    """
-    drift_ppm, sigma_ppm = clock.fit.drift_ppm, clock.fit.drift_sigma_ppm
-    return 1 + drift_ppm * 1e-6 if abs(drift_ppm) > 3 * sigma_ppm else 1.0
 
 
 def _serve(flash: weakref.ref[FirmwareFlash], closing: threading.Event) -> None:
