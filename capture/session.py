@@ -3,7 +3,8 @@
     SESSION/
       session.json        schema version, source, device, image, flash schedule, status
       frames.jsonl        one line a frame, appended and synced as it is written
-      frames/NNNNNN.png   the pictures, never resampled, in the sensor's orientation
+      frames/NNNNNN.png   the pictures (or .jpg, .exr), never resampled, in the sensor's orientation
+      flash.jsonl         the flash's edges as its device reported them, on the frames' time axis (optional)
       calibration.json    what is known of this camera and flash (optional)
       scene/              derived: cameras (COLMAP text model), points.ply, masks/
       portraits/NAME/     what was fitted
