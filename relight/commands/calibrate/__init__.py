@@ -1,0 +1,42 @@
+"""`relight calibrate`: what a camera and its lamp really do, each part into one calibration.json."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+
+#: Part -> its module, with `add_arguments` and `run`, and what it gives.
+_PARTS = {
+    "board": ("relight.commands.calibrate.board", "a ChArUco board to print at true scale"),
+    "intrinsics": (
+        "relight.commands.calibrate.intrinsics",
+        "focal length, centre and distortion from pictures of a board",
+    ),
+    "convert": (
+        "relight.commands.calibrate.convert",
+        "intrinsics from or for OpenCV, ROS, COLMAP, Kalibr or mrcal",
+    ),
+}
+
+EXAMPLE = (
+    "relight calibrate board --out board.pdf\n"
+    "  relight calibrate intrinsics VID_20261102_101530.mp4 --board board.json --out calibration.json"
+)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The parts of `relight calibrate` and their flags."""
+    parts = parser.add_subparsers(metavar="WHAT", required=True)
+    for name, (module_name, about) in _PARTS.items():
+        part = parts.add_parser(name, help=about, description=about[0].upper() + about[1:] + ".")
+        part.add_argument(
+            "--debug", action="store_true", default=argparse.SUPPRESS, help="show the traceback of an error"
+        )
+        module = importlib.import_module(module_name)
+        module.add_arguments(part)
+        part.set_defaults(part=module.run)
+
+
+def run(args: argparse.Namespace) -> None:
+    """Does the part that was asked for."""
+    args.part(args)
