@@ -218,8 +218,8 @@ class ClockFit:
         x = np.array([self._since_origin(sample.ticks) for sample in self._window])
         y = np.array([sample.middle_s - self._origin.middle_s for sample in self._window]) - x
         half = np.array([sample.half_s for sample in self._window])
-        # A delay anywhere within the excess: uniform, and so a third of its square.
-        excess = np.maximum(half - self._quickest_s, 0) ** 2 / 3
+        # What held up the one way or the other moves the middle by all of its half.
+        excess = np.maximum(half - self._quickest_s, 0) ** 2
         fade = np.exp(np.minimum(x, 0) / MEMORY_S)
         design = np.stack([np.ones_like(x), x], axis=1)
         known = np.diag([0.0, RATE_SIGMA**-2])

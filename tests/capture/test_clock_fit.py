@@ -84,6 +84,7 @@ def test_the_claimed_sigma_covers_the_error(line, drift_ppm):
                 error, sigma = clock.errors(fit, ahead_s)
                 ratios.append(error / sigma)
             clock.give(fit, 6)
+            assert abs(fit.drift_ppm - drift_ppm) < 5 * fit.drift_sigma_ppm
         assert fit.drift_ppm == pytest.approx(drift_ppm, abs=30)  # 1 ms of jitter over 15 s and 40 samples
         assert clock.errors(fit, 0.0)[1] < 1.2e-3
     assert np.max(np.abs(ratios)) < 4.5

@@ -15,6 +15,8 @@ from firmware_protocol.messages import Capability
 
 #: The firmware takes no train that begins sooner.
 LEAD_S = 1e-3
+#: No crystal is off by more.
+_CRYSTAL_PPM = 200.0
 
 
 def in_ticks(train: PulseTrain, hello: Hello, clock: DeviceClock, now_s: float, description: str) -> Train:
@@ -55,8 +57,8 @@ def in_ticks(train: PulseTrain, hello: Hello, clock: DeviceClock, now_s: float, 
 def _rate(clock: DeviceClock) -> float:
     """The device's seconds in a second of the host; 1 unless it is known to be something else.
 
-    The first second of round trips tells it to some 50 ppm: a resonator's 0.3 % is seen, a crystal's 20 ppm
-    is not and would only be made worse.
+    The first second of round trips tells it to some 50 ppm on an idle machine and ten times worse on a busy
+    one: a resonator's 0.3 % is seen, a crystal's 20 ppm is not and would only be made worse.
     """
     drift_ppm, sigma_ppm = clock.fit.drift_ppm, clock.fit.drift_sigma_ppm
-    return 1 + drift_ppm * 1e-6 if abs(drift_ppm) > 3 * sigma_ppm else 1.0
+    return 1 + drift_ppm * 1e-6 if abs(drift_ppm) > max(_CRYSTAL_PPM, 5 * sigma_ppm) else 1.0
