@@ -23,26 +23,41 @@ import numpy as np
 from benchmarks.record import write_record
 from benchmarks.soak_scene import COLUMNS, ROWS, Soak, soak_frames
 from capture.tagging import StreamTagger, TaggingConfig
+from capture.tagging.stream import CHUNK_S
 
+_SUMMARY = (
+    *("period_s", "period_sigma_s", "jitter_s", "missed", "phase_jumps", "segments", "readout_s"),
+    *("readout_sigma_s", "exposure_s", "exposure_sigma_s", "droop_share", "droop_sigma", "latency_s"),
+    *("latency_jitter_s", "matched", "unseen", "unscheduled", "contradictions", "flicker_hz", "labels"),
+    "warnings",
+)
 _PAGE = os.sysconf("SC_PAGE_SIZE")
 
 
-def run_soak(soak: Soak, *, scheduled: bool, config: TaggingConfig, report_every: int = 0) -> dict[str, Any]:
+def run_soak(
+    soak: Soak,
+    *,
+    scheduled: bool,
+    config: TaggingConfig,
+    chunk_s: float = CHUNK_S,
+    report_every: int = 0,
+) -> dict[str, Any]:
     """Streams a capture through the tagger and compares every tag with the truth.
 
     Args:
         soak: what is captured.
         scheduled: whether the flash reports its pulses.
         config: of the tagger.
+        chunk_s: likewise.
         report_every: frames between lines of progress; 0 = none.
     """
-    tagger = StreamTagger(COLUMNS, ROWS, config=config)
+    tagger = StreamTagger(COLUMNS, ROWS, config=config, chunk_s=chunk_s)
     truth: dict[int, tuple[float, float, float, tuple[int, ...]]] = {}
     counts: Counter[str] = Counter()
     wrong: list[dict[str, Any]] = []
     touched: dict[int, float] = {}
     memory: list[tuple[int, float]] = []
-    making_s = 0.0
+    making_s, held = 0.0, 0
     started_s = mark = time.process_time()
     frames = soak_frames(soak)
     count = 0
@@ -62,6 +77,7 @@ def run_soak(soak: Soak, *, scheduled: bool, config: TaggingConfig, report_every
         count += 1
         if count % 300 == 0:
             _compare(tagger.ready(), truth, counts, wrong)
+            held = max(held, tagger.held)
         if count % 3000 == 0:
             gc.collect()
             memory.append((count, _resident_mb()))
@@ -88,22 +104,13 @@ def run_soak(soak: Soak, *, scheduled: bool, config: TaggingConfig, report_every
         "false_unlit": sum(item["tag"] == 0 for item in wrong),
         "wrong": wrong[:50],
         "reasons": {name[7:]: counts[name] for name in sorted(counts) if name.startswith("reason ")},
-        "memory_mb": {"first": memory[0][1], "last": memory[-1][1], "mb_per_hour": _slope(memory, soak.rate_hz)}
-        if len(memory) > 3
-        else None,
+        "memory_mb": _memory(memory, soak.rate_hz),
         "cpu_s": round(time.process_time() - started_s - making_s, 1),
         "making_frames_cpu_s": round(making_s, 1),
         "tagging_ms_a_frame": round(1e3 * (time.process_time() - started_s - making_s) / max(count, 1), 2),
-        "summary": {
-            name: getattr(result, name)
-            for name in (
-                "period_s", "period_sigma_s", "jitter_s", "missed", "phase_jumps", "segments", "readout_s",
-                "readout_sigma_s", "exposure_s", "exposure_sigma_s", "droop_share", "droop_sigma", "latency_s",
-                "latency_jitter_s", "matched", "unseen", "unscheduled", "contradictions", "flicker_hz", "labels",
-                "warnings",
-            )
-        },
-    }  # fmt: skip
+        "held_frames_most": held,
+        "summary": {name: getattr(result, name) for name in _SUMMARY},
+    }
 
 
 def _compare(
@@ -139,10 +146,14 @@ def _resident_mb() -> float:
         return int(file.read().split()[1]) * _PAGE / 1e6
 
 
-def _slope(memory: list[tuple[int, float]], rate_hz: float) -> float:
-    """Growth of resident memory over the second half, MB an hour of capture."""
+def _memory(memory: list[tuple[int, float]], rate_hz: float) -> dict[str, float] | None:
+    """Resident memory: at first, at last, and its growth over the second half, MB an hour of capture."""
+    if len(memory) < 4:
+        return None
     half = np.array(memory[len(memory) // 2 :])
-    return float(np.polyfit(half[:, 0] / rate_hz / 3600, half[:, 1], 1)[0])
+    slope = float(np.polyfit(half[:, 0] / rate_hz / 3600, half[:, 1], 1)[0])
+    most = max(mb for _, mb in memory)
+    return {"first": memory[0][1], "most": most, "last": memory[-1][1], "mb_per_hour": slope}
 
 
 def main() -> None:

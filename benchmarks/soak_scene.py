@@ -1,4 +1,4 @@
-"""An endless capture at the size of the tagger's thumbnails, with everything that goes wrong in one, and truth.
+"""An endless capture at the size of the tagger's thumbnails, with all that goes wrong in one, and the truth.
 
 A head of light and shade before a textured room, seen by a camera that stands, is held or walks, through a
 rolling shutter; a lamp that blinks, droops, jitters, misses, is reset in the middle of a pulse and comes back
@@ -53,6 +53,7 @@ class Soak:
         unreadable_every: frames between black ones.
         stamp_s: standard deviation of a frame's stamp.
         flicker: depth of the room light's flicker while it flickers.
+        dark_s: how long frames go on after the last pulse.
         seed: of everything.
     """
 
@@ -74,6 +75,7 @@ class Soak:
     unreadable_every: float = 6000.0
     stamp_s: float = 1e-4
     flicker: float = 0.08
+    dark_s: float = 0.0
     seed: int = 0
 
 
@@ -129,12 +131,14 @@ def soak_frames(soak: Soak) -> Iterator[SoakFrame]:
     lamp = _pulses(soak, np.random.default_rng(soak.seed + 2))
     near: deque[tuple[int, LampPulse]] = deque()
     to_come = next(lamp, None)
-    number, k, lost = 0, 0, 0
+    number, k, lost, end_s = 0, 0, 0, 0.0
     reported: deque[float] = deque()
     while True:
         k += 1
         start_s = k / soak.rate_hz
-        if to_come is None and not near:
+        if to_come is not None or near:
+            end_s = start_s + soak.dark_s
+        elif start_s > end_s:
             return
         while to_come is not None and to_come.on_s < start_s + 1.0:
             near.append((number, to_come))

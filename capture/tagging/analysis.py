@@ -189,7 +189,8 @@ def _find_pulses(
     middle_s = np.array([0.5 * (pts_s[w.first] + pts_s[w.last]) for w in windows])
     coarse = fit_rhythm(middle_s, config)
     cycle = coarse.cycle if coarse is not None else np.full(len(windows), -1)
-    if flicker is not None and config.readout_s is None and abs(flicker.waves) > _LEAST_WAVES:
+    learnt = known is not None and known.shutter is not None
+    if not learnt and flicker is not None and config.readout_s is None and abs(flicker.waves) > _LEAST_WAVES:
         config = replace(config, readout_s=flicker.readout_s)  # the wave over the rows measures it
     edges = edge_range(pts_s, windows, interval_s, config)
     if known is not None and known.shutter is not None:

@@ -107,7 +107,7 @@ def _find_near(
     peak = np.unravel_index(int(np.argmax(spectrum)), spectrum.shape)
     # Without a wave, the spectrum of noise has a Rayleigh distribution: as many cells as here hardly reach
     # 4 medians.
-    ratio = float(spectrum[peak] / np.median(spectrum))
+    ratio = float(spectrum[peak] / (np.median(spectrum) + 1e-12))  # frames may be all the same
     if ratio < _LEAST_RATIO:
         return None
     frequency_hz, wave = float(frequency[peak[0]]), float(waves[peak[1]])

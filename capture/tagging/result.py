@@ -30,7 +30,8 @@ class FrameTag:
         lit_fraction: mean share of the pulse's light over the rows, 0..1; None where nothing can be said.
         confidence: probability that the label is right; of None, that the frame is neither lit nor unlit.
         reasons: remarks, and why a frame is left out: `partial_flash`, `flash_uncertain` (an edge may touch
-            it), `drift`, `clipped`, `clipped_frame`, `dropped_before`, `unreadable`.
+            it), `contradiction` (light and schedule disagree), `untagged` (nothing could be said), `drift`,
+            `clipped`, `clipped_frame`, `dropped_before`, `unreadable`.
     """
 
     flash: int | None

@@ -123,7 +123,7 @@ def _longest_chain(time_s: Floats, period_s: float) -> tuple[float, NDArray[np.i
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A way in which pulses may be regular: its probability, the period, and the scale of a step's lateness."""
+    """A way in which pulses may be regular: its probability, the period, the scale of a step's lateness."""
 
     weight: float
     period_s: float

@@ -103,6 +103,8 @@ def fit_shutter(
         commanded_s: [P] when each pulse was told to go on, by a clock that runs with the frames', NaN = not
             known; None = none is.
     """
+    if config.readout_s is not None and config.exposure_s is not None:
+        return Shutter(config.readout_s, config.exposure_s, 0.0, 0.0, 0.0)
     data, gain_prior = data.merged(_MERGE), gain_prior.reshape(-1, _MERGE).mean(axis=1)
     most = _thin(len(data.start_s), _MOST)
     asked_s = np.full(len(cycle), np.nan) if commanded_s is None else commanded_s

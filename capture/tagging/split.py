@@ -98,6 +98,8 @@ def split_frames(
         if not core.any():
             break
         unlit = ~ndimage.binary_dilation(core, iterations=1)
+        if not unlit.any():
+            break
         if turn >= _BLIND_ROUNDS:  # the classes are good enough to look only at unlit frames, and nearer ones
             gain = np.clip(local_gain(pts_s, log, unlit), -_LARGEST_LOG_GAIN, _LARGEST_LOG_GAIN)
             noise = _spread(gain[unlit]) + _LEAST_NOISE

@@ -194,6 +194,11 @@ class StreamTagger:
         """What to add to the schedule's times to come to the frames'; None = not known yet."""
         return self._offset_s
 
+    @property
+    def held(self) -> int:
+        """Frames that are kept in memory now."""
+        return len(self._kept.times_s)
+
     def ready(self) -> list[tuple[int, FrameTag]]:
         """(position, tag) of frames that have their final tag now, in order; each frame once."""
         out: list[tuple[int, FrameTag]] = []
@@ -401,17 +406,19 @@ class StreamTagger:
         place = np.arange(len(pts_s))
         mine = wrong & (place >= stretch.begin) & (place < cut)
         self._counts.happened("contradiction", [float(t) for t in pts_s[mine]])
-        begin_s, end_s = pts_s[stretch.begin], pts_s[cut - 1]
+        begin_s, end_s = pts_s[stretch.begin], pts_s[cut] if cut < len(pts_s) else np.inf
         inside = (on_s >= begin_s) & (on_s < end_s)
-        seen_s = np.array([pulse.t_on_s for pulse, _ in pulses])[np.isfinite(late)]
+        seen_s = np.concatenate(
+            [p.analysis.found.labels.on_s for p in parts if p.analysis is not None] or [np.zeros(0)]
+        )
         shown = predicted_lit_fraction(
             pts_s, on_s, on_s + length_s, readout_s=shutter.readout_s, exposure_s=shutter.exposure_s, rows=4
         ).max(axis=1)
         traces = np.zeros(len(pts_s), bool)  # of a pulse that came while frames were lost, perhaps
-        for time_s in on_s[inside]:
+        for time_s, own in zip(on_s, inside, strict=True):
             if np.any(np.abs(seen_s - time_s) < 0.5 * length_s + slack_s):
                 continue
-            if np.any(shown[(pts_s >= time_s) & (pts_s < time_s + length_s)] > 0):
+            if own and np.any(shown[(pts_s >= time_s) & (pts_s < time_s + length_s)] > 0):
                 self._counts.happened("unseen", [float(time_s)])
             traces |= (np.abs(pts_s - time_s) < 2 * length_s) & (possible > 0)
         covered = [

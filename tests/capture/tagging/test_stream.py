@@ -13,7 +13,7 @@ from capture.tagging import FrameTag, ProfileAccumulator, StreamTagger, TaggingC
 
 # Nothing goes wrong; the period is no multiple of the frames', so that pulses meet all phases of the shutter.
 QUIET = Soak(
-    pulses=26,
+    pulses=17,
     period_s=1.013,
     missed=0.0,
     reset_every=1e9,
@@ -25,9 +25,11 @@ QUIET = Soak(
     flicker=0.0,
     droop=0.0,
 )
-CONFIG = TaggingConfig(exposure_s=QUIET.exposure_s, risk=0.001, stamp_sigma_s=QUIET.stamp_s)
+CONFIG = TaggingConfig(
+    exposure_s=QUIET.exposure_s, readout_s=QUIET.readout_s, risk=0.001, stamp_sigma_s=QUIET.stamp_s
+)
 # Stretches so short that a test has several.
-SHORT = {"chunk_s": 8.0, "margin_s": 4.0}
+SHORT = {"chunk_s": 6.0, "margin_s": 3.0}
 
 
 @lru_cache(maxsize=8)
@@ -51,6 +53,12 @@ def streamed(frames, *, schedule=False, config=CONFIG, **sizes):
     return [frame_tag for _, frame_tag in tags], result
 
 
+@lru_cache(maxsize=1)
+def quiet():
+    """The undisturbed capture with its schedule: frames, tags, result."""
+    return filmed(QUIET), *streamed(filmed(QUIET), schedule=True)
+
+
 def wrong(frames, tags):
     """Frames called lit or unlit that are not."""
     return [
@@ -65,8 +73,8 @@ def test_a_short_capture_is_tagged_as_a_whole_one():
     accumulator = ProfileAccumulator(COLUMNS, ROWS, transfer="srgb")
     for frame in frames:
         accumulator.add(frame.picture, frame.pts_s)
-    whole = tag(accumulator.profiles())
-    tags, result = streamed(frames, config=None, chunk_s=40.0, margin_s=6.0)
+    whole = tag(accumulator.profiles(), config=CONFIG)
+    tags, result = streamed(frames, chunk_s=40.0, margin_s=6.0)
     assert tuple(tags) == whole.frames
     assert result.warnings == whole.warnings
     assert (result.period_s, result.readout_s, result.pulses) == (
@@ -93,44 +101,42 @@ def test_an_empty_capture_is_refused():
 
 
 def test_where_stretches_end_makes_no_difference_that_matters():
-    frames = filmed(QUIET)
-    one, _ = streamed(frames, schedule=True, chunk_s=8.0, margin_s=4.0)
-    other, result = streamed(frames, schedule=True, chunk_s=11.0, margin_s=5.0)
+    frames, one, result = quiet()
+    other, _ = streamed(frames, schedule=True, chunk_s=7.7, margin_s=3.0)
     assert wrong(frames, one) == wrong(frames, other) == []
     assert result.pulses == QUIET.pulses
-    # A frame at an edge is called uncertain by one and not by the other: in the first stretches, where the
-    # shutter is not known yet, up to a frame a pulse.
+    # A frame at an edge, of which there are two a pulse, is called uncertain by one and not by the other.
     differ = sum(a.flash != b.flash for a, b in zip(one, other, strict=True))
-    assert differ < 0.03 * len(frames)
+    assert differ <= 0.2 * QUIET.pulses
 
 
 def test_memory_holds_one_stretch_of_frames():
-    tagger = StreamTagger(COLUMNS, ROWS, config=CONFIG, chunk_s=4.0, margin_s=3.0)
+    tagger = StreamTagger(COLUMNS, ROWS, config=CONFIG, chunk_s=4.0, margin_s=2.0)
     held = []
-    for k, frame in enumerate(filmed(QUIET)[:600]):
+    for k, frame in enumerate(filmed(QUIET)[:420]):
         tagger.add(frame.picture, frame.pts_s)
         if k % 30 == 0:
             tagger.ready()
             held.append(tagger.held)
-    # A stretch of 10 s, and what comes in the second until `ready` is asked again.
-    assert max(held) <= 30 * (10 + 1) + 1
+    # A stretch of 8 s, and what comes in the second until `ready` is asked again.
+    assert max(held) <= 30 * (8 + 1) + 1
 
 
 def test_a_dead_flash_leaves_frames_unlit_or_untagged():
-    soak = replace(QUIET, pulses=14, dark_s=20.0)
+    soak = replace(QUIET, pulses=8, dark_s=14.0)
     frames = filmed(soak)
     tags, result = streamed(frames, schedule=True)
     assert wrong(frames, tags) == []
-    assert result.pulses == 14
-    dark = [given.flash for frame, given in zip(frames, tags, strict=True) if frame.pts_s > 16]
+    assert result.pulses == 8
+    dark = [given.flash for frame, given in zip(frames, tags, strict=True) if frame.pts_s > 10]
     # The camera stands still in this scene's first minutes, so the light says it of most.
     assert dark.count(0) > 0.9 * len(dark)
 
 
 def test_a_gap_in_time_begins_a_segment_with_its_own_rhythm():
-    frames = [frame for frame in filmed(QUIET) if not 12.2 < frame.pts_s < 15.9]
+    frames = [frame for frame in filmed(QUIET) if not 8.2 < frame.pts_s < 10.9]
     # after the gap, the flash has started anew at another phase: the gap is 60.37 s longer in truth
-    moved = [replace(f, pts_s=f.pts_s + 60.37, events=()) if f.pts_s > 14 else f for f in frames]
+    moved = [replace(f, pts_s=f.pts_s + 60.37, events=()) if f.pts_s > 9 else f for f in frames]
     tags, result = streamed(moved)
     assert wrong(moved, tags) == []
     assert result.segments == 2
@@ -147,7 +153,7 @@ def test_a_segment_too_short_to_be_tagged_is_not_guessed():
 
 
 def test_the_schedule_gives_the_latency():
-    _, result = streamed(filmed(QUIET), schedule=True)
+    _, _, result = quiet()
     assert result.matched == QUIET.pulses
     # The lamp is 4 ms late; a start is seen to a fraction of a millisecond, and readout and exposure enter.
     assert result.latency_s == pytest.approx(0.004, abs=1e-3)
@@ -157,8 +163,8 @@ def test_the_schedule_gives_the_latency():
 
 def test_frames_that_contradict_the_schedule_are_left_out():
     frames = list(filmed(QUIET))
-    # pulse 12 is reported but does not light: its frames are those of the second before it
-    lit = [k for k, frame in enumerate(frames) if 12 in frame.pulses]
+    # pulse 8 is reported but does not light: its frames are those of the second before it
+    lit = [k for k, frame in enumerate(frames) if 8 in frame.pulses]
     for k in lit:
         frames[k] = replace(frames[k], picture=frames[lit[0] - 3].picture)
     tags, result = streamed(frames, schedule=True)
@@ -171,7 +177,7 @@ def test_frames_that_contradict_the_schedule_are_left_out():
 def test_a_schedule_of_another_flash_is_not_believed():
     rng = np.random.default_rng(0)
     frames = [replace(f, events=()) for f in filmed(QUIET)]
-    strange = np.cumsum(rng.uniform(0.4, 1.9, 24))
+    strange = np.cumsum(rng.uniform(0.4, 1.9, 15))
     for time_s in strange:
         k = min(int(time_s * 30), len(frames) - 1)
         frames[k] = replace(frames[k], events=(float(time_s),))
@@ -182,7 +188,7 @@ def test_a_schedule_of_another_flash_is_not_believed():
 
 def test_pulses_are_counted_while_they_come():
     tagger = StreamTagger(COLUMNS, ROWS, config=CONFIG)
-    for frame in filmed(QUIET)[:300]:
+    for frame in filmed(QUIET)[:200]:
         tagger.expect(frame.events, QUIET.on_s)
         tagger.add(frame.picture, frame.pts_s)
         status = tagger.pulse_status()
@@ -209,16 +215,16 @@ def test_a_flash_that_is_not_seen_is_noticed_after_three_pulses():
 
 def test_no_frame_of_a_troubled_capture_is_mistagged():
     soak = Soak(
-        pulses=70,
+        pulses=40,
         missed=0.03,
-        reset_every=25,
+        reset_every=15,
         dropped=0.02,
-        burst_every=400,
-        stall_every=900,
+        burst_every=300,
+        stall_every=700,
         unreadable_every=500,
         seed=4,
     )
-    result = run_soak(soak, scheduled=True, config=CONFIG, chunk_s=16.0)
+    result = run_soak(soak, scheduled=True, config=CONFIG, chunk_s=20.0)
     assert (result["false_lit"], result["false_unlit"]) == (0, 0)
     assert result["frames_without_tag"] == 0
     # A pulse of which a burst has left a single frame, or that a reset has cut to a trace, may not be found.
