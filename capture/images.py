@@ -7,6 +7,7 @@ rotation.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -40,6 +41,12 @@ _PNG_PICTURE = [
     cv2.IMWRITE_PNG_FILTER_AVG,
 ]
 _PNG_MASK = [cv2.IMWRITE_PNG_COMPRESSION, 1]
+
+
+def natural_order(name: str) -> list[tuple[int, str]]:
+    """Sorting key by which frame_2 comes before frame_10."""
+    parts = re.split(r"(\d+)", name)
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts]
 
 
 def read_image(path: Path) -> NDArray[Any]:

@@ -44,8 +44,7 @@ from capture.errors import (
     ImageError,
     SourceError,
 )
-from capture.images import image_size, read_image
-from capture.importers.image_set import natural_order
+from capture.images import image_size, natural_order, read_image
 from capture.video import decode_video, probe_video
 from capture.video.colour import rgb_from_frame
 

@@ -10,7 +10,8 @@ from pathlib import Path
 
 from capture.colmap_model import is_colmap_model, read_colmap_model
 from capture.errors import SourceError
-from capture.importers.image_set import natural_order, write_image_set
+from capture.images import natural_order
+from capture.importers.image_set import write_image_set
 from capture.importers.options import ImportOptions, Progress
 from capture.importers.source_frame import SourceFrame
 from capture.ply import PointCloud

@@ -8,8 +8,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from capture.errors import ImageError, SourceError
-from capture.images import IMAGE_SUFFIXES, image_size
-from capture.importers.image_set import natural_order, write_image_set
+from capture.images import IMAGE_SUFFIXES, image_size, natural_order
+from capture.importers.image_set import write_image_set
 from capture.importers.options import ImportOptions, Progress
 from capture.importers.source_frame import SourceFrame
 from capture.session import Session

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
@@ -148,12 +147,6 @@ def describe_source(source: Mapping[str, Any], options: ImportOptions, posed: bo
     """What session.json says of the source: without a unit of length where there are no poses."""
     said = {key: value for key, value in source.items() if posed or key != "units"}
     return said | ({"without": sorted(options.without)} if options.without else {})
-
-
-def natural_order(name: str) -> list[tuple[int, str]]:
-    """Sorting key by which frame_2 comes before frame_10."""
-    parts = re.split(r"(\d+)", name)
-    return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts]
 
 
 def named_masks(folder: Path | None, names: Iterable[str]) -> dict[str, Path]:

@@ -6,8 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from capture.errors import SourceError
-from capture.images import IMAGE_SUFFIXES
-from capture.importers.image_set import natural_order
+from capture.images import IMAGE_SUFFIXES, natural_order
 
 #: Suffixes of camera RAW files, as LibRaw knows them.
 RAW_SUFFIXES = frozenset(

@@ -3,8 +3,8 @@ import pytest
 
 from capture.colmap_model import write_colmap_model
 from capture.errors import SourceError
+from capture.images import natural_order
 from capture.importers import ImportOptions, import_source
-from capture.importers.image_set import natural_order
 from capture.ply import PointCloud, read_ply, write_ply
 
 
