@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import TracebackType
 from typing import Any, Self
 
@@ -114,6 +114,7 @@ class SimulatedFlash:
     def close(self) -> None:
         """See `FlashDevice.close`."""
         self.off()
+        self._failure = self._failure or FlashError("The simulated flash is closed; open it again.")
 
     def __enter__(self) -> Self:
         return self
@@ -124,7 +125,10 @@ class SimulatedFlash:
         self.close()
 
     def _put_out(self, now_s: float) -> None:
+        cut = next((edge for edge in self._edges if edge.time_s > now_s), None)
         self._edges = deque(edge for edge in self._edges if edge.time_s <= now_s)
+        if cut is not None and not cut.on:  # it burns: it goes out now, not then
+            self._edges.append(replace(cut, time_s=now_s))
         self._darken_from(now_s)
 
     def _darken_from(self, time_s: float) -> None:

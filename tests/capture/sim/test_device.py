@@ -67,7 +67,9 @@ def test_off_ends_the_pulse_that_burns_and_those_to_come(bench):
     assert flash.off()
     assert [off - start_s for _, off in bench.light.pulses] == [pytest.approx(0.1)]
     bench.clock.sleep(10)
-    assert [edge.on for edge in flash.poll()] == [True]
+    edges = flash.poll()
+    assert [edge.on for edge in edges] == [True, False]
+    assert edges[1].time_s - start_s == pytest.approx(0.1)
 
 
 def test_half_the_exposure_is_half_the_light(bench, camera):
