@@ -4,7 +4,8 @@ Somebody walks around a head and keeps it in the middle. By the angle that he ha
 turned; what is far away moves through the picture by that turn. What is not so far moves less: a wall at
 distance Z behind a head at distance D by the share 1 - D / Z of it (small-motion flow, Longuet-Higgins and
 Prazdny 1980, of a rotation about a point at distance D). D / Z is taken to be 1/4, as with a head at 0.6 m
-and walls at 2.4 m; with walls at 1.5 m the gauge shows 80 % of the truth, at 5 m 117 %.
+and walls at 2.4 m, which is what the simulated rooms are; with walls at 1.5 m the gauge shows 80 % of the
+truth, at 5 m 117 %. Nothing in the picture tells this ratio well enough from so short steps.
 
 The turn is fitted robustly to the corners that are surely not the head: the largest group that moves alike,
 by a full rotation so that wide-angle pictures are not taken for more. Where there is no such group (bare

@@ -22,7 +22,7 @@ from capture.live.state import LiveState
 
 _STRIP_S = 3.0  # of labels that are shown
 _HOLD_S = 1.3  # what the last flash clipped is shown until the next one
-_BLURRED, _USELESS = 0.62, 0.55  # relative sharpness: remarked; corners would be followed badly
+_BLURRED, _USELESS = 0.55, 0.5  # relative sharpness: remarked; corners would be followed badly
 _PATIENCE_S = 0.5  # blurred ones are followed when nothing better comes
 _LATELY_S = 1.0
 _WALK_S = 3.0  # over which the speed of the walk is judged

@@ -144,7 +144,7 @@ function show(s) {
   const clip = s.clipped_subject;
   bar("clipped", clip / .1, percent(clip, 1), clip < .01 ? "good" : clip < .04 ? "warn" : "bad");
   bar("dark", s.dark, percent(s.dark), s.dark < .2 ? "good" : "warn");
-  bar("sharp", s.sharpness, percent(s.sharpness), s.sharpness > .6 ? "good" : "warn");
+  bar("sharp", s.sharpness, percent(s.sharpness), s.sharpness > .55 ? "good" : "warn");
   const m = s.motion;
   bar("head", m ?? 0, m === null ? "cannot tell" : m < .25 ? "still" : m < .6 ? "a little" : "moving",
     m > .6 ? "warn" : "good");

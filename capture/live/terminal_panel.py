@@ -160,7 +160,7 @@ def _rows(state: LiveState) -> list[tuple[str, Text]]:
         ),
         ("clipped", _bar(min(1.0, clipped / 0.1), colour, f"{100 * clipped:.1f} %")),
         ("dark", _bar(min(1.0, state.dark), "blue", f"{100 * state.dark:.0f} %")),
-        ("sharp", _bar(state.sharpness, "green" if state.sharpness > 0.6 else "yellow")),
+        ("sharp", _bar(state.sharpness, "green" if state.sharpness > 0.55 else "yellow")),
         ("head", moving.append("" if motion is None else f" {_motion_word(motion)}")),
         ("pulses", Text(_pulses(state))),
         (
