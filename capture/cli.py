@@ -175,13 +175,14 @@ def _capture(args: argparse.Namespace, config: CaptureConfig) -> None:
             shown = open_watch(config.duration_s, config.period_s, preview=args.preview, panel=not args.quiet)
             watch = stack.enter_context(shown)
         outcome = run_capture(camera, flash, bench, out, config, watch=watch, resume=args.resume)
+    if watch is None:
+        for sentence in outcome.warnings:
+            print(f"relight-capture: {sentence}", file=sys.stderr)
     _conclude(outcome)
 
 
 def _conclude(outcome: CaptureOutcome) -> None:
     session = outcome.session
-    for sentence in outcome.warnings:
-        print(f"relight-capture: {sentence}", file=sys.stderr)
     usable = [frame for frame in session.frames if frame.usable]
     lit = sum(frame.flash == 1 for frame in usable)
     print(f"{session.path}: {len(session.frames)} frames, {lit} lit and {len(usable) - lit} unlit ones kept")

@@ -87,4 +87,5 @@ class Display:
             self._monitor.edges(edges)
 
     def say(self, sentence: str) -> None:
-        """Nothing: warnings are printed when the panel is gone."""
+        """See `Watch.say`; above the panel, which redraws itself below what is printed."""
+        print(f"relight-capture: {sentence}", file=sys.stderr, flush=True)
