@@ -7,6 +7,7 @@ The lines come through the share as `guest/conftest.py` writes them: {"part", "e
 import json
 
 _FILE = "events.jsonl"
+_LOGS = ("stack.log", "output.log")
 
 
 class Events:
@@ -16,7 +17,8 @@ class Events:
         self.results = []
         self._share = share
         self._path = share / _FILE
-        self._path.unlink(missing_ok=True)
+        for old in (_FILE, *_LOGS):
+            (share / old).unlink(missing_ok=True)
         self._read = 0
         self._running = {}
         self._over = set()
@@ -39,7 +41,7 @@ class Events:
             self._over.add(part)
             if part in self._running:
                 self._add(part, self._running.pop(part), "failed", 0.0, self._output(), say)
-            elif event["code"] not in (0, 1):
+            elif event["code"] not in (0, 1) and not self._has_failed(part):
                 self._add(part, part, "failed", 0.0, self._output(), say)
         else:
             self._running.pop(part, None)
@@ -48,13 +50,16 @@ class Events:
     def _add(self, part, test, outcome, seconds, detail, say=lambda *_, **__: None):
         result = {"part": part, "test": test, "outcome": outcome, "seconds": seconds, "detail": detail}
         self.results.append(result)
-        say(f"{outcome:>8} {seconds:5.1f} s  {test}", flush=True)
+        say(f"{outcome:>8} {seconds:5.1f} s  {part}: {test}", flush=True)
         if outcome == "skipped":
             say(f"         {detail}", flush=True)
 
+    def _has_failed(self, part):
+        return any(result["part"] == part and result["outcome"] == "failed" for result in self.results)
+
     def _output(self):
         """Where the last test was when its time was over, and the last lines of all that was printed."""
-        files = [self._share / "stack.log", self._share / "output.log"]
+        files = [self._share / name for name in _LOGS]
         texts = [path.read_text(errors="replace") for path in files if path.exists()]
         return "\n".join("\n".join(text.splitlines()[-40:]) for text in texts)
 
@@ -81,7 +86,7 @@ class Events:
         for result in self.results:
             counts[result["outcome"]] += 1
             if result["outcome"] == "failed":
-                say(f"\n===== {result['test']}\n{result['detail']}")
+                say(f"\n===== {result['part']}: {result['test']}\n{result['detail']}")
         told = ", ".join(f"{number} {outcome}" for outcome, number in counts.items())
         say(f"\n{told}, {seconds:.0f} s")
         return 1 if counts["failed"] or not counts["passed"] else 0

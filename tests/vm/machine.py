@@ -98,7 +98,7 @@ class Machine:
     def _arguments(self, terminal):
         monitor = f"path={self._folder.resolve() / 'monitor'}"
         arguments = [self.parts.qemu, "-nodefaults", "-no-user-config", "-display", "none", "-no-reboot"]
-        arguments += ["-M", "pc,accel=tcg", "-cpu", PROCESSOR, "-smp", "1", "-m", str(MEMORY_MB)]
+        arguments += ["-M", "pc,accel=tcg", "-cpu", PROCESSOR, "-smp", "2", "-m", str(MEMORY_MB)]
         for folder in self.parts.firmware:
             arguments += ["-L", folder]
         arguments += ["-kernel", self._vmlinux, "-initrd", self._initramfs]

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from camera_contract import CameraContract
 from kernel import loaded, until
 from v4l2_controls import another_program
 
@@ -187,6 +188,19 @@ def test_a_camera_in_use_is_refused_in_one_sentence(camera):
     with pytest.raises(CameraError, match=r"use|busy"), open_camera(NODE) as second:
         second.lock(PROFILE)
     frames(camera, 2)
+
+
+class TestContract(CameraContract):
+    """What every camera must do; this machine is slow, so that frames are lost and their rate is not kept."""
+
+    profile = PROFILE
+    has_exposure = verified_by_light = steady_rate = False
+    loses_frames = True
+    timeout_s = PATIENCE_S
+
+    @pytest.fixture
+    def device(self, camera):
+        return camera
 
 
 def test_a_camera_that_is_pulled_out_is_gone_and_can_be_closed(other):

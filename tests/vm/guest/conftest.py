@@ -18,11 +18,16 @@ def _report(**event):
         lines.write(json.dumps({"part": PART} | event) + "\n")
 
 
+def pytest_configure(config):
+    config.addinivalue_line("markers", "limit_s(seconds): how long the test may take, where it is a long one")
+
+
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item):
     _report(event="start", test=item.name)
+    marker = item.get_closest_marker("limit_s")
     with (SHARE / "stack.log").open("w") as stack:
-        faulthandler.dump_traceback_later(LIMIT_S, exit=True, file=stack)
+        faulthandler.dump_traceback_later(marker.args[0] if marker else LIMIT_S, exit=True, file=stack)
         try:
             return (yield)
         finally:

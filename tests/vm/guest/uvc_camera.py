@@ -3,8 +3,8 @@
 Descriptors, requests and payloads are those of the USB Video Class 1.0 (usb.org, "Universal Serial Bus
 Device Class Definition for Video Devices", chapters 3 and 4, with its payload documents). The picture is a
 grey wedge in linear light that becomes brighter with exposure time and gain, and with a lamp; row after row,
-as a rolling shutter has it. What it does not model: noise, colour (white balance changes nothing), lost
-packets, the loss of settings between streams.
+as a rolling shutter has it. What it does not model: colour (white balance changes nothing), lost packets,
+the loss of settings between streams.
 """
 
 import struct
@@ -51,6 +51,10 @@ _PACKET_BYTES = 3072  # three of 1024 in a microframe, of which every eighth is 
 _END_OF_FRAME, _ERROR = 0x02, 0x40
 #: Frames between a new exposure time and the first picture that has it.
 LATENCY_FRAMES = 2
+#: Between the exposure of a frame's first row and its way over the bus: what the lamp did is known by then.
+AGE_S = 0.1
+#: Standard deviation, codes; the same eight pictures of it over and over.
+NOISE = 1.2
 
 
 @dataclass
@@ -279,6 +283,7 @@ class UvcCamera:
         self.device = USBDevice(0x1209, 0x0002, product="Grey Wedge", manufacturer="Tests", serial=serial)
         self.device.set_speed(core.SPEED_HIGH)
         self.device.add(_Video(self._control, self._streaming))
+        self._noise = np.random.default_rng(5).normal(0, NOISE, (8, *_SIZE[::-1])).astype(np.float32)
         column = np.linspace(0.05, 0.6, _SIZE[0], dtype=np.float32)
         self._scene = np.broadcast_to(column, _SIZE[::-1])
 
@@ -305,14 +310,15 @@ class UvcCamera:
         )
         exposure, gain = self._settings[-1 - LATENCY_FRAMES :][0]
         exposure_s = exposure * 1e-4
-        rows_s = start_s + np.arange(_SIZE[1], dtype=np.float64) / _SIZE[1] * self._readout_s
+        rows_s = start_s - AGE_S + np.arange(_SIZE[1], dtype=np.float64) / _SIZE[1] * self._readout_s
         lit_s = np.zeros(_SIZE[1])
         for on_s, off_s in self.lamp():
             lit_s += np.clip(np.minimum(rows_s + exposure_s, off_s) - np.maximum(rows_s, on_s), 0, None)
         light = self._scene * ((exposure_s + 2.0 * lit_s)[:, None] / 0.01) * (gain / 16)
         linear = np.clip(light, 0, 1)
         grey = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
-        code = np.rint(grey * 255).astype(np.uint8)
+        noise = self._noise[self._streaming.number % len(self._noise)]
+        code = np.rint(np.clip(grey * 255 + noise, 0, 255)).astype(np.uint8)
         return np.repeat(code[..., None], 3, axis=-1)
 
 
