@@ -40,8 +40,14 @@ class FrameSink:
         self._logger = ThreadPoolExecutor(1, thread_name_prefix="log")
         self._room = threading.Condition()
         self._largest, self._backlog = backlog_bytes, 0
+        self._waiting = 0
         self._failure: BaseException | None = None
         self.waits = 0
+
+    @property
+    def waiting(self) -> int:
+        """Frames that were taken and are not on the disk yet."""
+        return self._waiting
 
     def put(self, record: FrameRecord, data: bytes | NDArray[Any]) -> None:
         """Takes a frame.
@@ -67,6 +73,7 @@ class FrameSink:
             if self._failure is not None:
                 raise self._failure
             self._backlog += size
+            self._waiting += 1
         picture = self._writers.submit(self._write_picture, record.index, data)
         self._logger.submit(self._write_line, record, picture, size)
 
@@ -107,6 +114,7 @@ class FrameSink:
         finally:
             with self._room:
                 self._backlog -= size
+                self._waiting -= 1
                 self._room.notify_all()
 
 

@@ -108,8 +108,8 @@ def _stretch(black: float, white: float) -> NDArray[np.uint8]:
 class Watch(Protocol):
     """Who is shown the capture while it goes on: a panel in the terminal, a page in the browser."""
 
-    def frame(self, frame: LookedFrame) -> None:
-        """Each frame that could be read."""
+    def frame(self, frame: LookedFrame, waiting: int) -> None:
+        """Each frame that could be read, and how many wait to be written."""
 
     def edges(self, edges: Sequence[FlashEdge]) -> None:
         """The flash's edges as they are reported, on the frames' axis."""

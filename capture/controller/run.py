@@ -275,7 +275,7 @@ class _Capture:
         if looked is None:
             return None
         if self._watch is not None:
-            self._watch.frame(looked)
+            self._watch.frame(looked, sink.waiting)
         return looked.level, looked.clipped
 
     def _tag_meanwhile(self) -> None:

@@ -56,7 +56,7 @@ class Display:
         self._monitor: LiveMonitor | None = None
         self._shown_s = float("-inf")
 
-    def frame(self, frame: LookedFrame) -> None:
+    def frame(self, frame: LookedFrame, waiting: int) -> None:
         """See `Watch.frame`."""
         picture = frame.shown
         if self._monitor is None:
@@ -68,8 +68,9 @@ class Display:
                 stream.fps or _USUAL_FPS,
                 self._period_s,
                 self._duration_s,
+                rotation_deg=stream.rotation_deg,
             )
-        self._monitor.add(picture, frame.pts_s, frame.sequence)
+        self._monitor.add(picture, frame.pts_s, frame.sequence, queue=waiting)
         now_s = time.monotonic()
         if now_s < self._shown_s + 1.0 / _SHOWN_HZ:
             return

@@ -91,7 +91,7 @@ def test_a_slow_disk_makes_put_wait_instead_of_the_memory_grow(session, monkeypa
     with FrameSink(session, FORMAT, backlog_bytes=three_frames) as sink:
         for k in range(3):
             sink.put(record(k), picture(k))
-        assert sink.waits == 0
+        assert (sink.waits, sink.waiting) == (0, 3)
         threading.Timer(0.05, gate.set).start()
         sink.put(record(3), picture(3))
         assert sink.waits == 1

@@ -24,7 +24,7 @@ class Spy:
         self.at, self.then = at, then
         self.frames, self.edges_seen, self.said = [], [], []
 
-    def frame(self, frame):
+    def frame(self, frame, waiting):
         self.frames.append(frame)
         if len(self.frames) == self.at:
             self.then()
