@@ -169,7 +169,7 @@ def main() -> None:
     parser.add_argument(
         "--exposure-unknown", action="store_true", help="the camera does not tell its exposure"
     )
-    parser.add_argument("--risk", type=float, default=0.001, help="of the tagger")
+    parser.add_argument("--risk", type=float, default=1e-4, help="of the tagger")
     parser.add_argument("--report-every", type=int, default=9000, help="frames between lines of progress")
     args = parser.parse_args()
     soak = Soak(pulses=args.pulses, seed=args.seed)
