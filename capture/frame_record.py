@@ -19,7 +19,7 @@ EXCLUDING_REASONS = frozenset(
 _LARGEST_INDEX = 10**9
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, slots=True)
 class FrameRecord:
     """One line of frames.jsonl: what is known of a frame that was looked at.
 
