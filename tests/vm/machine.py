@@ -86,10 +86,15 @@ class Machine:
 
     def _write_command(self, command, environment):
         version = Path(self.parts.modules).name
+        # No LD_LIBRARY_PATH in the machine: ctypes looks for libraries in ldconfig's list alone.
+        found = [
+            f"echo {shlex.quote(folder)} >> /etc/ld.so.conf.d/machine.conf" for folder in self.parts.libraries
+        ]
         lines = [f"export {name}={shlex.quote(value)}" for name, value in environment.items()]
         lines += [
             "mkdir -p /lib/modules",
             f"ln -sfn {shlex.quote(self.parts.modules)} /lib/modules/{version}",
+            *(found and [*found, "ldconfig"]),
             f"cd {shlex.quote(os.getcwd())}",
             "exec " + shlex.join(map(str, command)) + " > /run/machine/share/output.log 2>&1",
         ]

@@ -15,7 +15,9 @@ import sys
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-QEMU = "qemu-system-x86_64"
+QEMU, QEMU_PACKAGE = "qemu-system-x86_64", "qemu-system-x86"
+#: For the camera back end that speaks USB itself; the machine uses the host's, or this one.
+LIBUSB = "libusb-1.0-0"
 #: Names the newest kernel of the distribution; its own name has the version in it.
 KERNEL_META_PACKAGE = "linux-image-amd64"
 #: The drivers that the tests meet; a kernel without them is of no use.
@@ -33,7 +35,7 @@ class Parts:
 
     Attributes:
         qemu: The program.
-        libraries: Folders that it needs in LD_LIBRARY_PATH; none when it is installed.
+        libraries: Folders of shared libraries that are not installed; none when all are.
         firmware: Folders with its start-up code; none when it is installed.
         busybox: A static one, for the start.
         kernel: Compressed image.
@@ -71,10 +73,11 @@ def fetch(cache):
     root = cache / "root"
     apt.unpack(["busybox-static", apt.dependency(KERNEL_META_PACKAGE, r"linux-image-.*-amd64")], root)
     qemu, libraries, firmware = shutil.which(QEMU), (), ()
-    if qemu is None:
-        apt.unpack(apt.missing("qemu-system-x86"), root)
-        qemu = root / "usr/bin" / QEMU
+    if missing := apt.missing(LIBUSB, *() if qemu else (QEMU_PACKAGE,)):
+        apt.unpack(missing, root)
         libraries = [root / "usr/lib/x86_64-linux-gnu", root / "lib/x86_64-linux-gnu"]
+    if qemu is None:
+        qemu = root / "usr/bin" / QEMU
         firmware = [root / "usr/share/seabios", root / "usr/share/qemu"]
     parts = Parts(
         qemu=str(qemu),
@@ -120,7 +123,7 @@ class _Apt:
         if made.returncode:
             reason = (made.stderr.strip() or made.stdout.strip()).splitlines()
             raise UnavailableError(
-                f"{program} {arguments[0]} failed: {reason[-1] if reason else 'no reason given'}"
+                f"{program} {arguments[0]} failed: {reason[-1].rstrip('.') if reason else 'no reason given'}"
             )
         return made.stdout
 
@@ -130,12 +133,14 @@ class _Apt:
             rf"^\s*Depends: ({pattern})$", self._run("apt-cache", "depends", package), re.MULTILINE
         )
         if not found:
-            raise UnavailableError(f"{package} names no kernel; Debian's does")
+            raise UnavailableError(
+                f"apt knows no {package}; this is no Debian, or its servers cannot be reached"
+            )
         return found[0]
 
-    def missing(self, package):
-        """The package and what it needs, as far as it is not installed."""
-        plan = self._run("apt-get", "--simulate", "--no-install-recommends", "install", package)
+    def missing(self, *packages):
+        """The packages and what they need, as far as they are not installed."""
+        plan = self._run("apt-get", "--simulate", "--no-install-recommends", "install", *packages)
         return re.findall(r"^Inst (\S+) ", plan, re.MULTILINE)
 
     def unpack(self, packages, root):
