@@ -48,25 +48,28 @@ def _unpacked(image):
 def initramfs(parts, made):
     """The archive that the kernel starts from, in the file `made`: busybox, init.sh, the first modules."""
     modules = Path(parts.modules)
-    if not (modules / "modules.dep").exists():
-        base = modules.parents[2] if modules.parents[1].name != "usr" else modules.parents[3]
-        subprocess.run([parts.busybox, "depmod", "-b", base, modules.name], check=True)
     files = {"init": INIT.read_bytes(), "bin/busybox": Path(parts.busybox).read_bytes()}
-    for module in _with_dependencies(modules):
+    for module in with_dependencies(modules, _FIRST_MODULES):
         files[f"lib/modules/{modules.name}/{module}"] = (modules / module).read_bytes()
     files[f"lib/modules/{modules.name}/modules.dep"] = (modules / "modules.dep").read_bytes()
     made.write_bytes(_cpio(files))
     return made
 
 
-def _with_dependencies(modules):
+def index_modules(modules, busybox):
+    """Writes the list of what needs what into a folder of modules."""
+    subprocess.run([busybox, "depmod", "-b", modules.parents[2], modules.name], check=True)
+
+
+def with_dependencies(modules, names):
+    """Paths of modules within their folder, with those that they need."""
     needs = {}
     for line in (modules / "modules.dep").read_text().splitlines():
         module, _, others = line.partition(":")
         needs[module] = others.split()
     found = {}
     for module, others in needs.items():
-        if Path(module).name.split(".")[0] in _FIRST_MODULES:
+        if Path(module).name.split(".")[0] in names:
             found |= dict.fromkeys([module, *others])
     return list(found)
 

@@ -15,13 +15,16 @@ import sys
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from image import index_modules, with_dependencies
+
 QEMU, QEMU_PACKAGE = "qemu-system-x86_64", "qemu-system-x86"
 #: For the camera back end that speaks USB itself; the machine uses the host's, or this one.
 LIBUSB = "libusb-1.0-0"
 #: Names the newest kernel of the distribution; its own name has the version in it.
 KERNEL_META_PACKAGE = "linux-image-amd64"
-#: The drivers that the tests meet; a kernel without them is of no use.
-NEEDED_MODULES = ("vivid", "uvcvideo", "vhci-hcd", "uhid", "cdc-acm", "ftdi_sio", "9p", "overlay")
+#: What the tests meet and what the machine itself runs on; a kernel without them is of no use.
+DRIVERS = ("vivid", "uvcvideo", "vhci-hcd", "uhid", "hid-generic", "cdc-acm", "ftdi_sio", "xhci-pci")
+MODULES = (*DRIVERS, "virtio_pci", "virtio_console", "9p", "9pnet_virtio", "overlay")
 REQUIREMENTS = Path(__file__).parent / "requirements.txt"
 
 
@@ -79,13 +82,14 @@ def fetch(cache):
     if qemu is None:
         qemu = root / "usr/bin" / QEMU
         firmware = [root / "usr/share/seabios", root / "usr/share/qemu"]
+    busybox = next(path for path in (root / "bin/busybox", root / "usr/bin/busybox") if path.exists())
     parts = Parts(
         qemu=str(qemu),
         libraries=tuple(map(str, libraries)),
         firmware=tuple(map(str, firmware)),
-        busybox=str(root / "bin/busybox" if (root / "bin/busybox").exists() else root / "usr/bin/busybox"),
+        busybox=str(busybox),
         kernel=str(_only(root.glob("boot/vmlinuz-*"))),
-        modules=str(_modules(root)),
+        modules=str(_modules(root, busybox)),
         python=str(_usbip(cache / "python")),
     )
     record.write_text(json.dumps(asdict(parts), indent=1))
@@ -160,12 +164,19 @@ def _only(paths):
     return found[-1]
 
 
-def _modules(root):
+def _modules(root, busybox):
+    """The modules' folder, without the 300 MB of those that nobody needs here."""
     folder = _only([*root.glob("lib/modules/*"), *root.glob("usr/lib/modules/*")])
     names = {path.name.split(".")[0] for path in folder.rglob("*.ko*")}
-    missing = [name for name in NEEDED_MODULES if name not in names]
+    missing = [name for name in MODULES if name not in names]
     if missing:
         raise UnavailableError(f"the kernel {folder.name} has no {', '.join(missing)}")
+    index_modules(folder, busybox)
+    kept = {folder / path for path in with_dependencies(folder, MODULES)}
+    for path in folder.rglob("*.ko*"):
+        if path not in kept:
+            path.unlink()
+    index_modules(folder, busybox)
     return folder
 
 
