@@ -3,7 +3,8 @@
 CalibrationError
 ├── BoardError       a board cannot be made, printed, or read from its description
 ├── IntrinsicsError  pictures of a board do not tell a camera's geometry
-└── LensFileError    a file of another tool with intrinsics cannot be read, or cannot hold ours
+├── LensFileError    a file of another tool with intrinsics cannot be read, or cannot hold ours
+└── FlashGeometryError  pictures of a board do not tell where the flash is and how it shines
 
 Every message is one sentence for the user: what is wrong, with its name, value and limit, and what to do
 next.
@@ -22,3 +23,7 @@ class IntrinsicsError(CalibrationError):
 
 class LensFileError(CalibrationError):
     """A file with intrinsics of another tool cannot be read, or cannot hold what is to be written."""
+
+
+class FlashGeometryError(CalibrationError):
+    """Pictures of a board with and without flash do not tell where the flash is and how it shines."""

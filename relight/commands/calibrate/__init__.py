@@ -12,6 +12,7 @@ _PARTS = {
         "relight.commands.calibrate.intrinsics",
         "focal length, centre and distortion from pictures of a board",
     ),
+    "flash": ("relight.commands.calibrate.flash", "where the flash is and how it shines, from a lit board"),
     "convert": (
         "relight.commands.calibrate.convert",
         "intrinsics from or for OpenCV, ROS, COLMAP, Kalibr or mrcal",

@@ -1,0 +1,127 @@
+"""`relight calibrate flash`: where the flash is and how it shines, from a board with and without it."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from relight.commands.arguments import positive_number
+
+if TYPE_CHECKING:
+    from calib.flash_geometry import FlashGeometry
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The flags."""
+    parser.add_argument(
+        "source",
+        type=Path,
+        metavar="SOURCE",
+        help="a session of the board with the flash blinking, or a folder with pairs NAME_flash and "
+        "NAME_noflash",
+    )
+    parser.add_argument(
+        "--board", required=True, type=Path, metavar="FILE", help="the .json of the printed board"
+    )
+    parser.add_argument(
+        "--calibration",
+        type=Path,
+        metavar="FILE",
+        help="calibration.json with the camera's intrinsics (default: the session's)",
+    )
+    parser.add_argument(
+        "--out",
+        type=Path,
+        metavar="FILE",
+        help="calibration.json to write into, or the session whose it is (default: that of --calibration)",
+    )
+    parser.add_argument(
+        "--paper-albedo",
+        type=positive_number,
+        default=1.0,
+        metavar="RHO",
+        help="albedo of the board's white (default 1: the strength is then that of this paper)",
+    )
+    parser.add_argument(
+        "--transfer",
+        default="srgb",
+        metavar="NAME",
+        help="transfer function of a folder's pictures, where the calibration has no response (default srgb)",
+    )
+
+
+def run(args: argparse.Namespace) -> None:
+    """Reads the pairs, finds the flash, saves and reports."""
+    from calib.board import load_board
+    from calib.calibration import load_calibration
+    from calib.errors import FlashGeometryError
+    from calib.flash_geometry import calibrate_flash
+    from calib.flash_pairs import open_pairs
+    from calib.flash_samples import collect_boards, lens_vector
+    from calib.flash_save import flash_evidence_path, save_flash
+    from capture.terminal import StageProgress
+
+    board = load_board(args.board)
+    known_at = _file_of(args.calibration or args.source)
+    if not known_at.is_file():
+        raise FlashGeometryError(
+            f"{known_at} does not exist; name the calibration.json with the camera's intrinsics "
+            "(--calibration)."
+        )
+    calibration = load_calibration(known_at)
+    lens_vector(calibration.intrinsics)  # before the pictures are read, which takes long
+    out = _file_of(args.out or known_at)
+    pairs = open_pairs(args.source, calibration, args.transfer)
+    with StageProgress() as progress:
+        collected = collect_boards(pairs.pairs(), pairs.count, board, calibration, progress)
+        found = calibrate_flash(collected, calibration, args.paper_albedo, progress)
+    save_flash(found, board, out, args.source.name)
+    print(f"pictures    {'; '.join([found.pairs, *pairs.left_out])}; linear by {pairs.transfer}")
+    print(_describe(found))
+    print(f"saved       {out}, and what it was made from in {flash_evidence_path(out).name}")
+
+
+def _file_of(path: Path) -> Path:
+    return path / "calibration.json" if path.is_dir() else path
+
+
+def _describe(found: FlashGeometry) -> str:
+    """What was found, in a few lines for a person."""
+    import numpy as np
+
+    from calib.flash_checks import axis_sigma, falloff_sigma
+    from calib.flash_geometry import poses_of
+    from calib.flash_model import FALLOFF
+
+    light, check = found.fit.light, found.held_out
+    place = ", ".join(
+        f"{name} {1e3 * value:.1f} ± {1e3 * sigma:.1f}"
+        for name, value, sigma in zip("xyz", light.position_m, found.position_sigma_m, strict=True)
+    )
+    axis = "along the optical axis (not determined)"
+    if found.axis_known:
+        right, down = np.degrees(np.arctan2(light.axis[:2], light.axis[2]))
+        axis = f"{right:.1f} degrees to the right, {down:.1f} down, ± {np.degrees(axis_sigma(found.fit)):.1f}"
+    strengths = ", ".join(
+        f"{name} {value:.4g} ± {100 * sigma / value:.1f} %"
+        for name, value, sigma in zip(
+            "RGB", found.strength, np.sqrt(np.diag(found.strength_covariance)), strict=True
+        )
+    )
+    squares, pulses = found.left_out
+    droop, droop_sigma = found.droop
+    lines = [
+        f"boards      {len(found.boards)} pulses on {poses_of(found)} poses; left out: {squares} squares, "
+        f"{pulses} pulses",
+        f"place       {place} mm from the lens (right, down, forwards)",
+        f"axis        {axis}",
+        f"falloff     cos^{light.vector[FALLOFF]:.2f} ± {falloff_sigma(found.fit):.2f}",
+        f"strength    {strengths} m^2 (paper taken as albedo {found.paper_albedo:g})",
+        f"pulses      {100 * found.fit.spread.pulse:.2f} % from each other, {100 * droop:+.2f} ± "
+        f"{100 * droop_sigma:.2f} % from first to last",
+        f"held out    {100 * check.rms:.2f} % off ({100 * check.expected:.2f} % expected), "
+        f"{100 * check.shape_rms:.2f} % within a board",
+        *(f"note        {sentence}" for sentence in found.notes),
+    ]
+    return "\n".join(lines)
