@@ -4,6 +4,9 @@ CalibrationError
 ├── BoardError       a board cannot be made, printed, or read from its description
 ├── IntrinsicsError  pictures of a board do not tell a camera's geometry
 ├── LensFileError    a file of another tool with intrinsics cannot be read, or cannot hold ours
+├── ResponseError    an exposure sweep does not tell a camera's response
+├── NoiseError       pictures do not tell dark level or noise
+├── FlatFieldError   pictures of an even surface do not tell how the lens falls off
 └── FlashGeometryError  pictures of a board do not tell where the flash is and how it shines
 
 Every message is one sentence for the user: what is wrong, with its name, value and limit, and what to do
@@ -23,6 +26,18 @@ class IntrinsicsError(CalibrationError):
 
 class LensFileError(CalibrationError):
     """A file with intrinsics of another tool cannot be read, or cannot hold what is to be written."""
+
+
+class ResponseError(CalibrationError):
+    """Pictures of an exposure sweep do not tell a camera's response."""
+
+
+class NoiseError(CalibrationError):
+    """Pictures do not tell dark level or noise."""
+
+
+class FlatFieldError(CalibrationError):
+    """Pictures of an even surface do not tell how the lens falls off."""
 
 
 class FlashGeometryError(CalibrationError):

@@ -13,6 +13,10 @@ _PARTS = {
         "focal length, centre and distortion from pictures of a board",
     ),
     "flash": ("relight.commands.calibrate.flash", "where the flash is and how it shines, from a lit board"),
+    "response": (
+        "relight.commands.calibrate.response",
+        "stored values to linear radiance, from an exposure sweep",
+    ),
     "convert": (
         "relight.commands.calibrate.convert",
         "intrinsics from or for OpenCV, ROS, COLMAP, Kalibr or mrcal",
@@ -21,7 +25,8 @@ _PARTS = {
 
 EXAMPLE = (
     "relight calibrate board --out board.pdf\n"
-    "  relight calibrate intrinsics VID_20261102_101530.mp4 --board board.json --out calibration.json"
+    "  relight calibrate intrinsics VID_20261102_101530.mp4 --board board.json --out calibration.json\n"
+    "  relight calibrate response --camera /dev/video0 --out calibration.json"
 )
 
 
