@@ -86,6 +86,13 @@ def _parser() -> argparse.ArgumentParser:
     flash.add_argument(
         "--period", type=float, default=1.0, metavar="S", help="from flash to flash (default 1)"
     )
+    flash.add_argument(
+        "--phase-step",
+        type=float,
+        default=0.382,
+        metavar="SHARE",
+        help="of a frame period, by which each flash comes later: so flashes meet all rows (default 0.382)",
+    )
     flash.add_argument("--on", type=float, default=0.1, metavar="S", help="length of a flash (default 0.1)")
     flash.add_argument(
         "--level", type=float, default=1.0, metavar="0..1", help="of a lamp that dims (default 1)"
@@ -132,6 +139,7 @@ def _config(args: argparse.Namespace) -> CaptureConfig:
     return CaptureConfig(
         duration_s=args.duration,
         period_s=args.period,
+        phase_step=args.phase_step,
         on_s=args.on,
         level=args.level,
         profile=_profile(args),
@@ -162,7 +170,7 @@ def _capture(args: argparse.Namespace, config: CaptureConfig) -> None:
     from capture.controller.run import run_capture
     from capture.devices.table import open_bench, open_camera, open_flash
 
-    camera_url = args.camera or _first_camera(args.flash)
+    camera_url = _first_camera(args.flash) if args.camera is None else args.camera
     out = args.out or Path(f"capture_{datetime.now():%Y%m%d_%H%M%S}")
     bench = open_bench(camera_url, args.flash, config.duration_s)
     with ExitStack() as stack:

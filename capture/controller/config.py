@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, field
 
 from capture.devices.camera import CameraProfile
-from capture.devices.flash import LONGEST_ON_S, SHORTEST_PERIOD_S
+from capture.devices.flash import LONGEST_ON_S, MOST_PULSES, SHORTEST_PERIOD_S
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -15,7 +15,10 @@ class CaptureConfig:
 
     Attributes:
         duration_s: From the first frame that is recorded to the last.
-        period_s: From one flash to the next.
+        period_s: From one flash to the next, before `phase_step`.
+        phase_step: Share of a frame period by which each flash comes later than that. A camera of 30 frames
+            and a lamp of one flash a second are in step for minutes: all flashes would begin at the same row,
+            most rows would never tell an edge, and the shutter could not be fitted. 0 = exactly in step.
         on_s: Length of a flash.
         level: Of the flash, 0 (exclusive) .. 1.
         profile: Of the camera.
@@ -27,6 +30,7 @@ class CaptureConfig:
 
     duration_s: float = 20.0
     period_s: float = 1.0
+    phase_step: float = 0.382
     on_s: float = 0.1
     level: float = 1.0
     profile: CameraProfile = field(default_factory=CameraProfile)
@@ -45,11 +49,18 @@ class CaptureConfig:
             raise ValueError(
                 f"on_s is {self.on_s}; it must be positive, at most {LONGEST_ON_S} s and half of the period"
             )
+        if not 0 <= self.phase_step < 1:
+            raise ValueError(f"phase_step is {self.phase_step}; it must be 0 or more and below 1")
         if not 0 < self.level <= 1:
             raise ValueError(f"level is {self.level}; it must be above 0 and at most 1")
         if not 3 * self.period_s <= self.duration_s < math.inf:
             raise ValueError(
                 f"duration_s is {self.duration_s}; three flashes, {3 * self.period_s:g} s, are the least"
+            )
+        if self.duration_s > MOST_PULSES * self.period_s:
+            raise ValueError(
+                f"duration_s is {self.duration_s}; {MOST_PULSES} flashes, {MOST_PULSES * self.period_s:g} s, "
+                "are the most"
             )
         if not self.kept_rate_hz > 0 or not math.isfinite(self.kept_rate_hz):
             raise ValueError(f"kept_rate_hz is {self.kept_rate_hz}; it must be a positive number")

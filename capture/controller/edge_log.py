@@ -12,6 +12,7 @@ import json
 from collections.abc import Iterable
 from pathlib import Path
 
+from capture.atomic import atomic_write
 from capture.devices.flash import FlashEdge
 from capture.errors import SessionError
 
@@ -29,18 +30,7 @@ class EdgeLog:
 
     def append(self, edges: Iterable[FlashEdge]) -> None:
         """Writes edges, on the frames' axis."""
-        lines = [
-            json.dumps(
-                {
-                    "time_s": round(edge.time_s, 7),
-                    "sigma_s": float(f"{edge.sigma_s:.2g}"),
-                    "on": edge.on,
-                    "pulse": edge.pulse,
-                }
-            )
-            + "\n"
-            for edge in edges
-        ]
+        lines = [_line(edge) for edge in edges]
         if not lines:
             return
         try:
@@ -71,3 +61,33 @@ def read_edges(session: Path) -> list[FlashEdge]:
         except (ValueError, TypeError) as cause:
             raise SessionError(f"{path}, line {number} is no edge of a flash: {cause}.") from cause
     return edges
+
+
+def drop_edges_after(session: Path, last_s: float) -> list[FlashEdge]:
+    """Ends the file where the frames end, so that it can be gone on with; what remains.
+
+    What a killed capture has of its flash after its last frame would lie in the break between the parts, or
+    in the next part; a torn last line would spoil the one that is appended to it.
+
+    Raises:
+        SessionError: A line before the last is malformed, or the file cannot be written.
+    """
+    path = session / "flash.jsonl"
+    if not path.is_file():
+        return []
+    edges = [edge for edge in read_edges(session) if edge.time_s <= last_s]
+    try:
+        atomic_write(path, "".join(map(_line, edges)).encode("ascii"))
+    except OSError as cause:
+        raise SessionError(f"{path} cannot be written: {cause.strerror or cause}.") from cause
+    return edges
+
+
+def _line(edge: FlashEdge) -> str:
+    content = {
+        "time_s": round(edge.time_s, 7),
+        "sigma_s": float(f"{edge.sigma_s:.2g}"),
+        "on": edge.on,
+        "pulse": edge.pulse,
+    }
+    return json.dumps(content) + "\n"

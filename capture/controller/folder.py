@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -12,7 +13,7 @@ import numpy as np
 from capture.calibration_file import Quantity, write_calibration_entries
 from capture.cameras import Camera
 from capture.controller.config import CaptureConfig
-from capture.controller.edge_log import read_edges
+from capture.controller.edge_log import drop_edges_after
 from capture.controller.looking import FrameLooker
 from capture.controller.time_axis import RESUMED_AFTER_S
 from capture.devices.camera import CameraDevice, KnowsScene, LockReport
@@ -44,7 +45,12 @@ def create_folder(
             "controls": [control.to_json() for control in lock.controls],
             "flash": {**asdict(flash.info), "capabilities": flash.capabilities.to_json()},
         },
-        flash_schedule={"period_s": config.period_s, "on_s": config.on_s, "level": config.level},
+        flash_schedule={
+            "period_s": config.period_s,
+            "phase_step": config.phase_step,
+            "on_s": config.on_s,
+            "level": config.level,
+        },
     )
 
 
@@ -80,8 +86,8 @@ def resume_folder(out: Path, camera: CameraDevice, looker: FrameLooker, on_s: fl
             continue
         if record.pts_s is not None and not {"unreadable", "missing_file"} & set(record.reasons):
             looker.look_again(record, _eight_bits(session.load_image(record)))
-    looker.expect(read_edges(session.path), on_s)
     last_s = max((record.pts_s for record in session.frames if record.pts_s is not None), default=None)
+    looker.expect(drop_edges_after(session.path, -math.inf if last_s is None else last_s), on_s)
     return session, 0.0 if last_s is None else last_s + RESUMED_AFTER_S
 
 

@@ -24,6 +24,8 @@ class Interrupts:
     def __enter__(self) -> Self:
         if threading.current_thread() is threading.main_thread():
             for number in _SIGNALS:
+                if signal.Signals(number).name == "SIGHUP" and signal.getsignal(number) is signal.SIG_IGN:
+                    continue  # nohup: it is to outlive its terminal
                 self._before[number] = signal.signal(number, self._take)
         return self
 

@@ -41,6 +41,9 @@ from capture.tagging.stream_summary import StreamResult
 _READ_TIMEOUT_S = 0.5
 _LEAD_S = 0.7  # from the first frame to the first flash: unlit frames to compare with
 _USUAL_FPS = 30.0
+# Of a wrong label: ten thousand flashes must pass without one (benchmarks/soak.py).
+_RISK = 1e-4
+_STAMP_SIGMA_S = 1e-4  # of a driver's stamps
 
 
 @dataclass(frozen=True)
@@ -125,6 +128,8 @@ class _Capture:
             exposure_s=lock.value("exposure_s"),
             shortest_period_s=min(0.5, 0.8 * config.period_s),
             longest_on_s=max(0.35, 1.5 * config.on_s),
+            risk=_RISK,
+            stamp_sigma_s=_STAMP_SIGMA_S,
         )
         self._looker = FrameLooker(camera.format, tagging, flash.info.name)
         self._tagger = ThreadPoolExecutor(1, thread_name_prefix="tags")
@@ -229,11 +234,12 @@ class _Capture:
 
     def _start_train(self) -> None:
         config = self._config
-        count = min(65535, 1 + math.ceil(config.duration_s / config.period_s))
+        period_s = config.period_s + config.phase_step / self._fps
+        count = min(65535, 1 + math.ceil(config.duration_s / period_s))
         self._flash.start(
             PulseTrain(
                 start_s=self._clock.now_s() + _LEAD_S,
-                period_s=config.period_s,
+                period_s=period_s,
                 on_s=config.on_s,
                 count=count,
                 level=config.level,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 
 import numpy as np
 
@@ -89,4 +89,5 @@ class Display:
 
     def say(self, sentence: str) -> None:
         """See `Watch.say`; above the panel, which redraws itself below what is printed."""
-        print(f"relight-capture: {sentence}", file=sys.stderr, flush=True)
+        with suppress(OSError):  # the terminal may be gone; the capture is not
+            print(f"relight-capture: {sentence}", file=sys.stderr, flush=True)

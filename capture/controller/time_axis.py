@@ -13,8 +13,9 @@ from collections import deque
 
 from capture.devices.camera import CapturedFrame
 
-#: Break of unknown length between a killed capture and its continuation, as it is written down.
-RESUMED_AFTER_S = 2.0
+#: Break of unknown length between a killed capture and its continuation, as it is written down; longer than
+#: the longest period of a flash, so that no rhythm is looked for across it.
+RESUMED_AFTER_S = 3.0
 _WINDOW_S = 10.0
 _LEAST_STEP_S = 1e-4
 

@@ -32,6 +32,17 @@ class Terminal(io.StringIO):
         return True
 
 
+class ClosedTerminal(Terminal):
+    """A window that is closed while it is drawn into; a pipe whose reader has ended."""
+
+    closed_now = False
+
+    def write(self, text):
+        if self.closed_now:
+            raise OSError(5, "Input/output error")
+        return super().write(text)
+
+
 def rendered(state):
     console = Console(file=io.StringIO(), width=80, record=True)
     console.print(panel(state))
@@ -107,3 +118,23 @@ def test_nothing_is_drawn_when_there_was_nothing_to_show():
     with TerminalPanel(stream, VirtualClock()):
         pass
     assert stream.getvalue() == ""
+
+
+def test_a_terminal_that_cannot_redraw_gets_lines(monkeypatch):
+    monkeypatch.setenv("TERM", "dumb")
+    stream = Terminal()
+    with TerminalPanel(stream, VirtualClock()) as shown:
+        shown.show(STATE)
+    assert stream.getvalue() == line(STATE) + "\n"
+
+
+@pytest.mark.parametrize("on_terminal", [True, False])
+def test_a_closed_terminal_does_not_end_the_capture(on_terminal, monkeypatch):
+    clock, stream = VirtualClock(), ClosedTerminal()
+    monkeypatch.setattr(stream, "isatty", lambda: on_terminal)
+    with TerminalPanel(stream, clock) as shown:
+        shown.show(STATE)
+        stream.closed_now = True
+        for _ in range(3):
+            clock.sleep(5.0)
+            shown.show(STATE)

@@ -213,6 +213,31 @@ def test_a_flash_that_is_not_seen_is_noticed_after_three_pulses():
     assert seconds < 4.0
 
 
+def test_frames_that_come_seconds_after_their_pulses_do_not_make_them_unseen():
+    """A busy machine reads its frames late, while the flash's reports come in time."""
+    late_s = 3.0
+    frames = filmed(QUIET)[:200]
+    events = [time_s for frame in frames for time_s in frame.events]
+    tagger = StreamTagger(COLUMNS, ROWS, config=CONFIG)
+    for frame in frames:
+        tagger.add(frame.picture, frame.pts_s)
+        while events and events[0] <= frame.pts_s + late_s:
+            tagger.expect([events.pop(0)], QUIET.on_s)
+        assert tagger.pulse_status().unseen <= 1
+
+
+def test_pulses_before_a_break_are_not_waited_for_after_it():
+    """Those of a killed capture, when it is gone on with: nobody asked while its frames came."""
+    tagger = StreamTagger(COLUMNS, ROWS, config=CONFIG)
+    dark = [frame for frame in filmed(QUIET) if frame.most == 0]
+    for k, frame in enumerate(dark[:150]):
+        tagger.add(frame.picture, k / 30)
+    tagger.expect(range(5), QUIET.on_s)
+    for k, frame in enumerate(dark[150:210]):
+        tagger.add(frame.picture, 8.0 + k / 30)
+        assert tagger.pulse_status().unseen == 0
+
+
 def test_no_frame_of_a_troubled_capture_is_mistagged():
     soak = Soak(
         pulses=40,
