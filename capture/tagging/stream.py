@@ -182,7 +182,7 @@ class StreamTagger:
             self._on_s = on_s if on_s is not None else self._on_s
             if self._offset_s is None:
                 del self._commands[:-_MOST_COMMANDS]
-            self._watch.expect(len(times))
+            self._watch.expect(times)
 
     def pulse_status(self) -> PulseStatus:
         """Whether pulses are seen, a second or so after they came."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -58,15 +59,16 @@ class PulseWatch:
         """Takes a frame's mean linear light of blocks [n, n]."""
         if self._frames and pts_s - self._frames[-1][0] > self._config.longest_period_s:
             self._frames.clear()
+            self._reported.clear()  # nobody looked
         self._frames.append((pts_s, square))
         while self._frames[0][0] < pts_s - _WINDOW_S:
             self._frames.popleft()
 
-    def expect(self, count: int) -> None:
-        """The flash has reported so many more pulses."""
+    def expect(self, times_s: Sequence[float]) -> None:
+        """The flash has reported pulses; their frames may come much later on a machine that is busy."""
         now_s = self._frames[-1][0] if self._frames else -np.inf
-        self._expected += count
-        self._reported.extend([now_s] * count)
+        self._expected += len(times_s)
+        self._reported.extend(max(now_s, time_s) for time_s in times_s)
 
     def status(self) -> PulseStatus:
         """How it stands."""
