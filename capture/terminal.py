@@ -14,6 +14,7 @@ import sys
 import time
 import traceback
 from collections.abc import Callable
+from contextlib import suppress
 from types import TracebackType
 from typing import TYPE_CHECKING, Self, TextIO
 
@@ -116,6 +117,7 @@ def _bars(stream: TextIO) -> Progress:
 
 
 def _complain(program: str, sentence: str, debug: bool) -> None:
-    if debug:
-        traceback.print_exc()
-    print(f"{program}: {sentence}", file=sys.stderr)
+    with suppress(OSError):  # the terminal may be gone
+        if debug:
+            traceback.print_exc()
+        print(f"{program}: {sentence}", file=sys.stderr)

@@ -58,6 +58,10 @@ class CameraProfile:
             value = getattr(self, name)
             if value is not None and not (math.isfinite(value) and value > 0):
                 raise ValueError(f"{name} is {value}; it must be a positive number")
+        for name in ("gain", "focus"):
+            value = getattr(self, name)
+            if value is not None and not math.isfinite(value):
+                raise ValueError(f"{name} is {value}; it must be a finite number")
         if self.mains_hz not in (None, 0, 50, 60):
             raise ValueError(f"mains_hz is {self.mains_hz}; it must be 50, 60 or 0")
 

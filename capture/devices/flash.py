@@ -17,6 +17,8 @@ from typing import Any, Protocol, Self
 #: Hard limits of every flash, ours or bought; firmware_protocol/PROTOCOL.md says why.
 LONGEST_ON_S = 0.25
 SHORTEST_PERIOD_S = 0.333334
+#: In one train.
+MOST_PULSES = 65535
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,8 +52,8 @@ class PulseTrain:
             raise ValueError(
                 f"on_s is {self.on_s}; a flash lasts at most {LONGEST_ON_S} s and less than its period"
             )
-        if not 1 <= self.count <= 65535:
-            raise ValueError(f"count is {self.count}, not 1..65535")
+        if not 1 <= self.count <= MOST_PULSES:
+            raise ValueError(f"count is {self.count}, not 1..{MOST_PULSES}")
         if not 0 < self.level <= 1:
             raise ValueError(f"level is {self.level}, not above 0 and at most 1")
 

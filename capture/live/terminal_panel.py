@@ -7,7 +7,9 @@ changes its colour with it.
 from __future__ import annotations
 
 import math
+import os
 import sys
+from contextlib import suppress
 from types import TracebackType
 from typing import TYPE_CHECKING, Self, TextIO
 
@@ -19,6 +21,7 @@ if TYPE_CHECKING:
     from rich.live import Live
     from rich.text import Text
 
+_CANNOT_REDRAW = ("dumb", "unknown")
 _REDRAW_S = 0.125
 _LINE_S = 2.0
 _BAR = 24
@@ -48,9 +51,10 @@ class TerminalPanel:
         self._live: Live | None = None
         self._shown_s = -math.inf
         self._last: LiveState | None = None
+        self._gone = False
 
     def __enter__(self) -> Self:
-        if self._stream.isatty():
+        if self._stream.isatty() and os.environ.get("TERM") not in _CANNOT_REDRAW:
             from rich.console import Console
             from rich.live import Live
 
@@ -64,7 +68,8 @@ class TerminalPanel:
         if self._last is not None:
             self._draw(self._last)
         if self._live is not None:
-            self._live.stop()
+            with suppress(OSError):
+                self._live.stop()
             self._live = None
 
     def show(self, state: LiveState) -> None:
@@ -76,10 +81,15 @@ class TerminalPanel:
             self._draw(state)
 
     def _draw(self, state: LiveState) -> None:
-        if self._live is not None:
-            self._live.update(panel(state, self._title), refresh=True)
-        else:
-            print(line(state), file=self._stream, flush=True)
+        if self._gone:
+            return
+        try:
+            if self._live is not None:
+                self._live.update(panel(state, self._title), refresh=True)
+            else:
+                print(line(state), file=self._stream, flush=True)
+        except OSError:  # whoever looked has closed the window; the capture goes on
+            self._gone = True
         self._last = None
 
 
