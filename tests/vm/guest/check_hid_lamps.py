@@ -172,7 +172,11 @@ def test_a_pressed_button_ends_the_train(plug):
     assert not model.on
 
 
-def test_a_lamp_goes_dark_when_the_program_is_killed_in_a_flash(scheme, plug):
+@pytest.mark.parametrize(
+    ("scheme", "blow"),
+    [(scheme, signal.SIGKILL) for scheme in LAMPS] + [("litra", signal.SIGSTOP)],
+)
+def test_a_lamp_goes_dark_when_the_program_is_killed_or_stands_still_in_a_flash(scheme, blow, plug):
     """By the device's own watchdog, or by the process that the back end keeps for that."""
     model, _ = plug(scheme)
     program = (
@@ -185,10 +189,11 @@ def test_a_lamp_goes_dark_when_the_program_is_killed_in_a_flash(scheme, plug):
     )
     process = subprocess.Popen([sys.executable, "-c", program], env=os.environ | {"PYTHONPATH": os.getcwd()})
     until(lambda: model.changes, "light")
-    process.send_signal(signal.SIGKILL)
-    process.wait(10)
+    process.send_signal(blow)
     until(lambda: not model.changes[-1][1], "darkness", 2.0)
     time.sleep(1.2)
+    process.kill()
+    process.wait(10)
     assert [lit for _, lit in model.changes] == [True, False]
     (on_s, _), (off_s, _) = model.changes
     assert off_s - on_s <= 0.25 + TOLERANCE_S

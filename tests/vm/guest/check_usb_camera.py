@@ -7,14 +7,13 @@ camera goes through the tests in their order, because a lock with its look at th
 from contextlib import suppress
 from dataclasses import replace
 from itertools import pairwise
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 import uvc_camera
 from kernel import loaded, until
 from usb_bus import plugged
-from uvc_camera import UvcCamera
+from uvc_camera import UvcCamera, video_node
 from v4l2_controls import another_program
 
 from capture.devices.camera import CameraProfile, mean_linear
@@ -48,14 +47,6 @@ def desk():
         before = model.settings()
         with open_camera(node) as camera:
             yield SimpleNamespace(model=model, node=node, pull=pull, before=before, camera=camera)
-
-
-def video_node():
-    """The camera's node; the driver makes another one for metadata."""
-    for entry in Path("/sys/class/video4linux").glob("video*"):
-        if "Grey Wedge" in (entry / "name").read_text() and (entry / "index").read_text() == "0\n":
-            return f"/dev/{entry.name}"
-    return None
 
 
 def frames(camera, count):

@@ -10,6 +10,7 @@ the loss of settings between streams.
 import struct
 import time
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -320,6 +321,14 @@ class UvcCamera:
         noise = self._noise[self._streaming.number % len(self._noise)]
         code = np.rint(np.clip(grey * 255 + noise, 0, 255)).astype(np.uint8)
         return np.repeat(code[..., None], 3, axis=-1)
+
+
+def video_node():
+    """The camera's node; the driver makes another one, for metadata. None = not yet."""
+    for entry in Path("/sys/class/video4linux").glob("video*"):
+        if "Grey Wedge" in (entry / "name").read_text() and (entry / "index").read_text() == "0\n":
+            return f"/dev/{entry.name}"
+    return None
 
 
 def _yuyv(rgb):
