@@ -181,6 +181,10 @@ class Commands:
             return None
         return _once(found[2], on_s - self.times_s[found[2]]), found[3]
 
+    def can_tell(self, pulses: int) -> bool:
+        """Whether so many pulses are enough to say that the two do not agree."""
+        return min(len(self.times_s), pulses) >= _LEAST_LOCKED
+
     def _offsets(self, on_s: Floats) -> list[float]:
         if self.offset_s is not None:
             return [self.offset_s]

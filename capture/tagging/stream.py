@@ -27,10 +27,10 @@ from capture.tagging.analysis import Analysis, analyse, steady_squares
 from capture.tagging.config import TaggingConfig
 from capture.tagging.dark import UNTAGGED, label_dark, light_stays
 from capture.tagging.drift import DriftStep
-from capture.tagging.expected import find_contradictions, predicted_lit_fraction
 from capture.tagging.known import Commands, KnownFlash
 from capture.tagging.profiles import FrameProfiles, ProfileAccumulator
 from capture.tagging.result import FrameTag, Pulse, TagResult
+from capture.tagging.schedule_check import Schedule, hold_against_schedule
 from capture.tagging.split import BLOCKS
 from capture.tagging.stream_summary import (
     Counts,
@@ -364,15 +364,15 @@ class StreamTagger:
                 self._offset_s = matched[1]
                 partner = matched[0][np.searchsorted(every, on_s)]
                 late[partner >= 0] = on_s[partner >= 0] - commands.times_s[partner[partner >= 0]]
-            elif len(on_s):
+            elif len(on_s) and commands.can_tell(len(every)):
                 self._counts.happened("unlocked", [float(stretch.profiles.pts_s[stretch.begin])])
             if self._offset_s is not None and (matched is not None or not len(on_s)):
-                tags = self._without_contradictions(stretch, cut, tags, pulses, late, parts)
+                tags = self._held_against_schedule(stretch, cut, tags, pulses, late, parts)
         for (pulse, light), late_s in zip(pulses, late, strict=True):
             self._table.add(pulse, light, float(late_s), self._segment)
         return tags
 
-    def _without_contradictions(
+    def _held_against_schedule(
         self,
         stretch: _Stretch,
         cut: int,
@@ -383,60 +383,33 @@ class StreamTagger:
     ) -> list[FrameTag]:
         assert stretch.commands is not None
         assert self._offset_s is not None
-        pts_s = stretch.profiles.pts_s
-        on_s = stretch.commands.times_s + self._offset_s
-        lengths = [pulse.t_off_s - pulse.t_on_s for pulse, _ in pulses]
-        length_s = float(np.median(lengths)) if lengths else stretch.commands.on_s or _USUAL_ON_S
-        _, jitter_s = self._table.lateness()
-        slack_s = max(_SLACK_S, _SLACK_SIGMAS * (jitter_s or 0.0))
-        shutter = next((p.analysis.found.shutter for p in parts if p.analysis is not None), None)
-        shutter = shutter or self._known.shutter
+        found = [part.analysis.found for part in parts if part.analysis is not None]
+        shutter = found[0].shutter if found else self._known.shutter
         if shutter is None:
             return tags
-        wrong, possible = find_contradictions(
-            pts_s,
-            tags,
-            on_s,
-            on_s + length_s,
+        lengths = [pulse.t_off_s - pulse.t_on_s for pulse, _ in pulses]
+        _, jitter_s = self._table.lateness()
+        schedule = Schedule(
+            on_s=stretch.commands.times_s + self._offset_s,
+            length_s=float(np.median(lengths)) if lengths else stretch.commands.on_s or _USUAL_ON_S,
+            slack_s=max(_SLACK_S, _SLACK_SIGMAS * (jitter_s or 0.0)),
             readout_s=shutter.readout_s,
             exposure_s=shutter.exposure_s,
-            slack_s=slack_s,
+        )
+        return hold_against_schedule(
+            stretch.profiles.pts_s,
+            tags,
+            range(stretch.begin, cut),
+            schedule,
+            seen_s=np.concatenate([part.labels.on_s for part in found] or [np.zeros(0)]),
+            unmatched_s=[
+                pulse.t_on_s
+                for (pulse, _), late_s in zip(pulses, late, strict=True)
+                if not np.isfinite(late_s)
+            ],
+            counts=self._counts,
             config=self._config,
         )
-        place = np.arange(len(pts_s))
-        mine = wrong & (place >= stretch.begin) & (place < cut)
-        self._counts.happened("contradiction", [float(t) for t in pts_s[mine]])
-        begin_s, end_s = pts_s[stretch.begin], pts_s[cut] if cut < len(pts_s) else np.inf
-        inside = (on_s >= begin_s) & (on_s < end_s)
-        seen_s = np.concatenate(
-            [p.analysis.found.labels.on_s for p in parts if p.analysis is not None] or [np.zeros(0)]
-        )
-        shown = predicted_lit_fraction(
-            pts_s, on_s, on_s + length_s, readout_s=shutter.readout_s, exposure_s=shutter.exposure_s, rows=4
-        ).max(axis=1)
-        traces = np.zeros(len(pts_s), bool)  # of a pulse that came while frames were lost, perhaps
-        for time_s, own in zip(on_s, inside, strict=True):
-            if np.any(np.abs(seen_s - time_s) < 0.5 * length_s + slack_s):
-                continue
-            if own and np.any(shown[(pts_s >= time_s) & (pts_s < time_s + length_s)] > 0):
-                self._counts.happened("unseen", [float(time_s)])
-            traces |= (np.abs(pts_s - time_s) < 2 * length_s) & (possible > 0)
-        covered = [
-            pulse.t_on_s
-            for (pulse, _), late_s in zip(pulses, late, strict=True)
-            if not np.isfinite(late_s) and on_s[0] < pulse.t_on_s < on_s[-1]
-        ]
-        self._counts.happened("unscheduled", covered)
-        out = list(tags)
-        for k in range(stretch.begin, cut):
-            if mine[k]:
-                out[k] = replace(
-                    tags[k], flash=None, confidence=0.5, reasons=(*tags[k].reasons, "contradiction")
-                )
-            elif traces[k] and tags[k].flash == 0:
-                reasons = (*tags[k].reasons, "flash_uncertain")
-                out[k] = replace(tags[k], flash=None, lit_fraction=None, confidence=0.5, reasons=reasons)
-        return out
 
     def _count(self, stretch: _Stretch, cut: int, tags: list[FrameTag], parts: list[_Part]) -> None:
         """What the summary needs of a stretch's own frames."""

@@ -274,7 +274,8 @@ class Counts:
                 "than exposure, readout and frame interval together."
             )
         if rhythm.period_s is None:
-            out.append(f"{len(table)} pulses are too few to tell a period.")
+            pulses = "1 pulse is" if len(table) == 1 else f"{len(table)} pulses are"
+            out.append(f"{pulses} too few to tell a period.")
         if rhythm.missed_s:
             times = ", ".join(f"{t:.2f}" for t in rhythm.missed_s[:5])
             out.append(
