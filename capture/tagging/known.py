@@ -160,8 +160,7 @@ class Commands:
         Args:
             on_s: [P] starts of pulses, increasing.
         """
-        least = _LEAST_LOCKED if self.offset_s is None else 1
-        if len(self.times_s) < least or len(on_s) < least:
+        if not self.can_tell(len(on_s)):
             return None
         found: tuple[int, float, NDArray[np.int_], float] | None = None
         for start_s in self._offsets(on_s):
@@ -177,13 +176,17 @@ class Commands:
             rank = (matched, -abs(offset_s))
             if found is None or rank > found[:2]:
                 found = (*rank, np.where(near, partner, -1), offset_s)
-        if found is None or found[0] < max(least, _LEAST_MATCHED * len(on_s)):
+        if found is None or found[0] < max(self._least, _LEAST_MATCHED * len(on_s)):
             return None
         return _once(found[2], on_s - self.times_s[found[2]]), found[3]
 
+    @property
+    def _least(self) -> int:
+        return _LEAST_LOCKED if self.offset_s is None else 1
+
     def can_tell(self, pulses: int) -> bool:
-        """Whether so many pulses are enough to say that the two do not agree."""
-        return min(len(self.times_s), pulses) >= _LEAST_LOCKED
+        """Whether so many pulses are enough to say whether the two agree."""
+        return min(len(self.times_s), pulses) >= self._least
 
     def _offsets(self, on_s: Floats) -> list[float]:
         if self.offset_s is not None:

@@ -17,18 +17,17 @@ from __future__ import annotations
 import itertools
 import threading
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from capture.errors import TaggingError
-from capture.tagging.analysis import Analysis, analyse, steady_squares
+from capture.tagging.analysis import steady_squares
 from capture.tagging.config import TaggingConfig
 from capture.tagging.dark import UNTAGGED, label_dark, light_stays
-from capture.tagging.drift import DriftStep
 from capture.tagging.known import Commands, KnownFlash
-from capture.tagging.profiles import FrameProfiles, ProfileAccumulator
+from capture.tagging.profiles import ProfileAccumulator
 from capture.tagging.result import FrameTag, Pulse, TagResult
 from capture.tagging.schedule_check import Schedule, hold_against_schedule
 from capture.tagging.split import BLOCKS
@@ -39,6 +38,7 @@ from capture.tagging.stream_summary import (
     StreamResult,
     kind_of,
 )
+from capture.tagging.stretches import Part, Stretch, added_light, parts_of, steps_of
 from capture.tagging.tagger import pulses_of, result_of, shutter_is_known, with_remarks
 from capture.tagging.watch import PulseStatus, PulseWatch
 
@@ -47,44 +47,12 @@ Floats = NDArray[np.float64]
 #: New frames in a stretch, and what it shares with its neighbours on each side, seconds. Six pulses on each
 #: side settle what a rhythm says; more frames in a stretch cost memory (15 kB each) and delay.
 CHUNK_S, MARGIN_S = 40.0, 6.0
-# A stretch in which no flash is found is looked at in halves down to this length: it may have died inside.
-_SHORTEST_S = 8.0
 # Least doubt of a scheduled edge when frames are checked against it, and in deviations of the lateness.
 _SLACK_S, _SLACK_SIGMAS = 0.015, 5.0
 # Commands that are kept while none has been matched.
 _MOST_COMMANDS = 400
 # A pulse's length when neither the schedule nor the light has told it.
 _USUAL_ON_S = 0.1
-
-
-@dataclass(frozen=True, eq=False)
-class _Stretch:
-    """Frames that are looked at together.
-
-    Attributes:
-        profiles: [K] of them.
-        base: position of the first.
-        begin: index of the first that has no tag yet.
-        last: it ends a segment.
-        only: it is all of the capture.
-        commands: of the flash around it; None = none known.
-    """
-
-    profiles: FrameProfiles
-    base: int
-    begin: int
-    last: bool
-    only: bool
-    commands: Commands | None
-
-
-@dataclass(frozen=True, eq=False)
-class _Part:
-    """A part of a stretch's readable frames [first, end) with what was found in it; None = no flash."""
-
-    first: int
-    end: int
-    analysis: Analysis | None
 
 
 class StreamTagger:
@@ -215,7 +183,7 @@ class StreamTagger:
                 out += self._tag(stretch)
         return self._sum(out)
 
-    def _next(self, *, final: bool) -> _Stretch | None:
+    def _next(self, *, final: bool) -> Stretch | None:
         """The next stretch that is complete."""
         with self._lock:
             times = np.array(self._kept.times_s)
@@ -234,7 +202,7 @@ class StreamTagger:
             if last and self._borders:
                 self._borders.pop(0)
             only = self._emitted == 0 and final and last and end == len(times)
-            return _Stretch(
+            return Stretch(
                 self._kept.profiles(0, end), self._base, begin, last, only, self._commands_near(times, end)
             )
 
@@ -249,20 +217,20 @@ class StreamTagger:
             commands = commands[(at > times[0] - reach) & (at < times[end - 1] + reach)]
         return Commands(commands, self._offset_s, self._on_s) if len(commands) else None
 
-    def _tag(self, stretch: _Stretch) -> list[tuple[int, FrameTag]]:
+    def _tag(self, stretch: Stretch) -> list[tuple[int, FrameTag]]:
         """Tags of a stretch's frames that have none yet, up to its margin."""
         profiles, seen = stretch.profiles, np.flatnonzero(stretch.profiles.readable)
         self._interval_s = profiles.interval_s
         try:
-            parts = self._parts(stretch, seen)
+            parts = parts_of(stretch, seen, self._config, self._known)
         except TaggingError as refusal:
             self._refused = str(refusal)
-            parts = [_Part(0, len(seen), None)]
+            parts = [Part(0, len(seen), None)]
         if stretch.only and parts[0].analysis is not None:
             self._whole = result_of(profiles, seen, parts[0].analysis, self._config)
         tags = [tag for part in parts for tag in self._labels(stretch, seen, part)]
         pulses = [
-            (pulse, _added_light(part.analysis, pulse, seen[part.first : part.end]))
+            (pulse, added_light(part.analysis, pulse, seen[part.first : part.end]))
             for part in parts
             if part.analysis is not None
             for pulse in pulses_of(part.analysis.found, seen[part.first : part.end])
@@ -273,7 +241,7 @@ class StreamTagger:
         if stretch.only and parts[0].analysis is not None:
             drifted[seen] = parts[0].analysis.drift.affected
         else:
-            drifted[new] = self._level.affected(profiles.pts_s[new], self._steps(parts, profiles.pts_s[new]))
+            drifted[new] = self._level.affected(profiles.pts_s[new], steps_of(parts, profiles.pts_s[new]))
         tags = with_remarks(profiles, seen, tags, drifted[seen], self._config)
         if self._segment and stretch.begin == 0:
             tags[0] = replace(tags[0], reasons=(*tags[0].reasons, "dropped_before"))
@@ -283,33 +251,7 @@ class StreamTagger:
         self._forget(stretch, cut)
         return [(stretch.base + k, tags[k]) for k in range(stretch.begin, cut)]
 
-    def _parts(self, stretch: _Stretch, seen: NDArray[np.int_]) -> list[_Part]:
-        """The stretch, or its halves and their halves where there is no flash in all of it.
-
-        Raises:
-            TaggingError: it is all of the capture and cannot be tagged.
-        """
-        readable = stretch.profiles.take(seen)
-        known = None if stretch.only else self._known
-
-        def attempt(first: int, end: int) -> list[_Part]:
-            part = readable.take(np.arange(first, end))
-            try:
-                if len(part) < 8:
-                    raise TaggingError(f"Only {len(part)} frames can be used; at least 8 are needed.")
-                found = analyse(part, self._config, known, stretch.commands)
-            except TaggingError:
-                if stretch.only:
-                    raise
-                if len(part) < 16 or part.pts_s[-1] - part.pts_s[0] < 2 * _SHORTEST_S:
-                    return [_Part(first, end, None)]
-                middle = (first + end) // 2
-                return attempt(first, middle) + attempt(middle, end)
-            return [_Part(first, end, found)]
-
-        return attempt(0, len(readable))
-
-    def _labels(self, stretch: _Stretch, seen: NDArray[np.int_], part: _Part) -> list[FrameTag]:
+    def _labels(self, stretch: Stretch, seen: NDArray[np.int_], part: Part) -> list[FrameTag]:
         """The flash in a part's frames."""
         if part.analysis is not None:
             self._steady_light = False
@@ -324,7 +266,7 @@ class StreamTagger:
             return [UNTAGGED] * len(index)
         return label_dark(frames.pts_s, squares, self._known.pattern, self._config)
 
-    def _cut(self, stretch: _Stretch, pulses: list[Pulse]) -> int:
+    def _cut(self, stretch: Stretch, pulses: list[Pulse]) -> int:
         """Where the stretch's own frames end: between two pulses, a margin before its end."""
         times = stretch.profiles.pts_s
         wanted = int(np.searchsorted(times, times[-1] - self._margin_s))
@@ -333,23 +275,13 @@ class StreamTagger:
         cut = min(near, key=lambda k: abs(k - wanted), default=wanted)
         return max(cut, stretch.begin + 1)
 
-    def _steps(self, parts: list[_Part], pts_s: Floats) -> tuple[DriftStep, ...]:
-        """Changes of exposure in the stretch's own frames."""
-        return tuple(
-            step
-            for part in parts
-            if part.analysis is not None
-            for step in part.analysis.drift.steps
-            if pts_s[0] <= step.time_s <= pts_s[-1]
-        )
-
     def _checked(
         self,
-        stretch: _Stretch,
+        stretch: Stretch,
         cut: int,
         tags: list[FrameTag],
         pulses: list[tuple[Pulse, float]],
-        parts: list[_Part],
+        parts: list[Part],
     ) -> list[FrameTag]:
         """The tags after a comparison with the schedule; counts the pulses of the stretch's own frames."""
         late = np.full(len(pulses), np.nan)
@@ -374,12 +306,12 @@ class StreamTagger:
 
     def _held_against_schedule(
         self,
-        stretch: _Stretch,
+        stretch: Stretch,
         cut: int,
         tags: list[FrameTag],
         pulses: list[tuple[Pulse, float]],
         late: Floats,
-        parts: list[_Part],
+        parts: list[Part],
     ) -> list[FrameTag]:
         assert stretch.commands is not None
         assert self._offset_s is not None
@@ -411,12 +343,12 @@ class StreamTagger:
             config=self._config,
         )
 
-    def _count(self, stretch: _Stretch, cut: int, tags: list[FrameTag], parts: list[_Part]) -> None:
+    def _count(self, stretch: Stretch, cut: int, tags: list[FrameTag], parts: list[Part]) -> None:
         """What the summary needs of a stretch's own frames."""
         pts_s = stretch.profiles.pts_s
         begin_s, end_s = float(pts_s[stretch.begin]), float(pts_s[cut - 1])
         self._counts.labels.update(kind_of(tags[k]) for k in range(stretch.begin, cut))
-        self._counts.stepped(self._steps(parts, pts_s[stretch.begin : cut]))
+        self._counts.stepped(steps_of(parts, pts_s[stretch.begin : cut]))
         seen = np.flatnonzero(stretch.profiles.readable)
         for part in parts:
             index = seen[part.first : part.end]
@@ -432,7 +364,7 @@ class StreamTagger:
             ):
                 self._counts.flicker = flicker.frequency_hz, flicker.depth
 
-    def _forget(self, stretch: _Stretch, cut: int) -> None:
+    def _forget(self, stretch: Stretch, cut: int) -> None:
         """Drops the frames that no later stretch needs."""
         times = stretch.profiles.pts_s
         with self._lock:
@@ -497,14 +429,3 @@ class StreamTagger:
             flicker_depth=None if counts.flicker is None else counts.flicker[1],
             warnings=tuple(schedule) if self._refused is None else (self._refused,),
         )
-
-
-def _added_light(analysis: Analysis | None, pulse: Pulse, seen: NDArray[np.int_]) -> float:
-    """Mean linear light that a pulse adds to the frames that it lights in full; NaN where there is none."""
-    assert analysis is not None
-    first, last = np.searchsorted(seen, pulse.frames)
-    lit = [k for k in range(first, last) if analysis.frames[k].flash == 1]
-    beside = [k for k in (first - 1, last) if 0 <= k < len(seen) and analysis.frames[k].flash == 0]
-    if not lit or not beside:
-        return float("nan")
-    return float(np.mean(analysis.squares[lit]) - np.mean(analysis.squares[beside]))
