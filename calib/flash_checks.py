@@ -14,15 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.errors import FlashGeometryError
-from calib.flash_fit import (
-    LightFit,
-    LitBoard,
-    error_covariance,
-    fit_light,
-    light_slopes,
-    relative_residuals,
-    stacked,
-)
+from calib.flash_boards import LitBoard, error_covariance, light_slopes, relative_residuals, stacked
+from calib.flash_fit import LightFit, fit_light
 from calib.flash_model import AXIS, FALLOFF, LIGHT_NAMES, LOG_STRENGTH, POSITION
 
 Floats = NDArray[np.float64]

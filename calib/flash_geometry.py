@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from calib.calibration import Calibration
 from calib.errors import FlashGeometryError
+from calib.flash_boards import LitBoard, stacked
 from calib.flash_checks import (
     HeldOut,
     axis_sigma,
@@ -24,9 +25,10 @@ from calib.flash_checks import (
     hold_out,
     weak_directions,
 )
-from calib.flash_fit import LightFit, LitBoard, find_strangers, fit_light, pulse_gains, stacked
+from calib.flash_fit import LightFit, fit_light, pulse_gains
 from calib.flash_model import AXIS, DROOP, FALLOFF, LIGHT_SIZE, LOG_STRENGTH, Light
 from calib.flash_samples import CollectedBoards
+from calib.flash_strangers import find_strangers
 
 Floats = NDArray[np.float64]
 Progress = Callable[[str, float], None]

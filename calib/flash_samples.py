@@ -21,7 +21,7 @@ from calib.board import Board
 from calib.board_detection import BoardDetector, BoardView, Problem
 from calib.calibration import Calibration, Intrinsics
 from calib.errors import FlashGeometryError
-from calib.flash_fit import LitBoard
+from calib.flash_boards import LitBoard
 from calib.flash_model import Light, log_light
 from calib.flash_pairs import FlashPair, LinearPicture
 from calib.projection import LENS_SIZE, project, project_with_slopes

@@ -15,7 +15,7 @@ from calib.board import Board, save_board
 from calib.board_detection import BoardDetector, Problem
 from calib.calibration import Calibration, Intrinsics, Quantity, load_calibration, save_calibration
 from calib.errors import FlashGeometryError
-from calib.flash_fit import LitBoard
+from calib.flash_boards import LitBoard
 from calib.flash_pairs import FlashPair, LinearPicture, open_pairs, pulses_of
 from calib.flash_samples import Refusal, collect_boards, lens_vector, lit_board
 from calib.flash_save import flash_evidence_path
@@ -113,9 +113,9 @@ def random_pose(rng, near=0.3, far=0.5, tilt=0.55):
 
 @pytest.fixture(scope="module")
 def pairs(photograph):
-    """[(lit, unlit)] of twelve poses; the flash loses four percent over them."""
+    """[(lit, unlit)] of ten poses; the flash loses four percent over them."""
     rng = np.random.default_rng(4)
-    droop = np.linspace(1.02, 0.98, 12)
+    droop = np.linspace(1.02, 0.98, 10)
     return [photograph(RIG, random_pose(rng), seed, gain) for seed, gain in enumerate(droop)]
 
 
@@ -161,8 +161,7 @@ def test_a_folder_of_pairs_becomes_a_flash_within_its_uncertainty(tmp_path, pair
     folder = folder_of(pairs, tmp_path)
     assert command(folder, "--out", tmp_path / "out.json") == 0
     said = capsys.readouterr().out
-    print(said)
-    assert "12 pairs, 12 used" in said
+    assert "10 pairs, 10 used" in said
     found = load_calibration(tmp_path / "out.json")
     truths = {
         "flash_offset_cam_m": RIG.offset_m,
@@ -181,10 +180,10 @@ def test_a_folder_of_pairs_becomes_a_flash_within_its_uncertainty(tmp_path, pair
         quantity = getattr(found, name)
         assert (np.abs(quantity.value - truth) < 4 * quantity.sigma + 1e-6).all(), (name, quantity)
         assert (quantity.sigma < largest[name]).all(), (name, quantity.sigma)
-        assert "12 pulses on 12 poses" in quantity.source
+        assert "10 pulses on 10 poses" in quantity.source
     evidence = json.loads(flash_evidence_path(tmp_path / "out.json").read_text())
     assert np.array(evidence["covariance"]).shape == (8, 8)
-    assert len(evidence["pulses"]) == 12
+    assert len(evidence["pulses"]) == 10
     droop = evidence["droop"]
     assert abs(droop["change"] - (0.98 / 1.02 - 1)) < 4 * droop["sigma"] < 0.04
     assert evidence["held_out"]["rms"] < 1.5 * evidence["held_out"]["expected"] < 0.03
@@ -310,6 +309,7 @@ def test_a_set_that_tells_nothing_is_one_sentence_and_changes_no_file(tmp_path, 
     [
         (lambda folder: (folder / "camera.json").unlink(), "does not exist"),
         (lambda folder: (folder / "00_noflash.png").unlink(), "holds no pairs"),
+        (lambda folder: (folder / "board.json").unlink(), "board.json cannot be read"),
         (lambda folder: write_png(folder / "00_flash.png", np.zeros((48, 64, 3), np.uint8)), "64 x 48"),
         (
             lambda folder: (folder / "camera.json").write_text(
@@ -325,6 +325,12 @@ def test_what_is_missing_is_named(tmp_path, capsys, prepare, words):
     prepare(folder)
     assert command(folder) == 1
     assert words in capsys.readouterr().err.strip().splitlines()[-1]
+
+
+def test_a_source_that_is_not_there_is_named(tmp_path, capsys):
+    save_board(BOARD, tmp_path / "board.json")
+    assert main(["calibrate", "flash", "nowhere", "--board", str(tmp_path / "board.json")]) == 1
+    assert "nowhere is no session and no folder" in capsys.readouterr().err.strip().splitlines()[-1]
 
 
 def test_no_session_and_lenses_of_more_terms_are_refused(tmp_path):

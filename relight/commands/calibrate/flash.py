@@ -63,16 +63,16 @@ def run(args: argparse.Namespace) -> None:
     from capture.terminal import StageProgress
 
     board = load_board(args.board)
-    known_at = _file_of(args.calibration or args.source)
-    if not known_at.is_file():
+    known_at = args.calibration or args.source / "calibration.json"
+    if args.source.exists() and not known_at.is_file():
         raise FlashGeometryError(
             f"{known_at} does not exist; name the calibration.json with the camera's intrinsics "
             "(--calibration)."
         )
     calibration = load_calibration(known_at)
+    pairs = open_pairs(args.source, calibration, args.transfer)
     lens_vector(calibration.intrinsics)  # before the pictures are read, which takes long
     out = _file_of(args.out or known_at)
-    pairs = open_pairs(args.source, calibration, args.transfer)
     with StageProgress() as progress:
         collected = collect_boards(pairs.pairs(), pairs.count, board, calibration, progress)
         found = calibrate_flash(collected, calibration, args.paper_albedo, progress)
