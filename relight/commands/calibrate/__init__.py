@@ -17,6 +17,8 @@ _PARTS = {
         "relight.commands.calibrate.response",
         "stored values to linear radiance, from an exposure sweep",
     ),
+    "dark": ("relight.commands.calibrate.dark", "dark level and noise, from dark pictures and from pairs"),
+    "flat": ("relight.commands.calibrate.flat", "the lens' fall-off to the corners, from an even surface"),
     "convert": (
         "relight.commands.calibrate.convert",
         "intrinsics from or for OpenCV, ROS, COLMAP, Kalibr or mrcal",
