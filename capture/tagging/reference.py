@@ -101,7 +101,8 @@ class Reference:
             level.append(np.log(expected))
             doubt.append(np.log(_blocks(from_a)) - np.log(_blocks(from_b)))
         # The blend of two predictions with independent errors is off by about half their difference.
-        scatter = cv2.blur(np.mean(np.square(doubt), axis=0), (3, 3))
+        # A blur by running sums leaves rounding below zero where both predictions are the same.
+        scatter = np.maximum(cv2.blur(np.mean(np.square(doubt), axis=0), (3, 3)), 0.0)
         return PulseGain(
             frames=np.asarray(frames),
             gain=np.array(gain),

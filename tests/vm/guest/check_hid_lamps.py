@@ -26,6 +26,7 @@ from uhid import UhidDevice
 from capture.devices.bench import MonotonicClock
 from capture.devices.flash import PulseTrain
 from capture.devices.hid import blink1, litra, relay
+from capture.devices.hid.guard import LIMIT_S
 from capture.devices.table import open_flash
 from capture.errors import FlashError, FlashGoneError
 
@@ -196,4 +197,6 @@ def test_a_lamp_goes_dark_when_the_program_is_killed_or_stands_still_in_a_flash(
     process.wait(10)
     assert [lit for _, lit in model.changes] == [True, False]
     (on_s, _), (off_s, _) = model.changes
-    assert off_s - on_s <= 0.25 + TOLERANCE_S
+    assert (
+        off_s - on_s <= LIMIT_S + 2 * TOLERANCE_S
+    )  # another process has to wake, open the lamp, and tell it
