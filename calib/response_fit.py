@@ -111,7 +111,8 @@ class ResponseResult:
     @property
     def bend(self) -> float:
         """The largest distance of the response from a straight line, in shares of white."""
-        line = self.stored if self.linear.ndim == 1 else self.stored[:, None]
+        straight = np.minimum(self.stored / (1.0 - self.dark.mean()), 1.0)
+        line = straight if self.linear.ndim == 1 else straight[:, None]
         return float(np.abs(self.linear - line).max())
 
 
@@ -151,10 +152,11 @@ def fit_response(groups: SweepGroups, dark: Floats | None = None) -> ResponseRes
             "guessed."
         )
     nodes = np.arange(256) / 255.0 if groups.step > 1e-3 else np.arange(1025) / 1024.0
-    linear, sigma = _table(fit, nodes, groups.step)
+    # What a clipped pixel is at once the dark level is off.
+    linear, sigma = _table(fit, nodes, groups.step, 1.0 - float(black.mean()))
     if len(channels) == 3:
         linear, sigma = _by_channel(
-            linear, sigma, nodes, covered, groups, stored, seen, unclipped, kept, low, warnings
+            linear, sigma, nodes, covered, groups, stored, seen, unclipped, kept, low, black, warnings
         )
     frames = _frame_checks(groups, fit, wrong, kept, stored, seen, channels)
     warnings += [
@@ -267,12 +269,12 @@ def _without_wrong_frames(
             )
 
 
-def _table(fit: CurveFit, nodes: Floats, step: float) -> tuple[Floats, Floats]:
-    """Radiance at stored values, and its standard deviation."""
-    design = fit.basis.values(nodes)
-    linear = np.exp(design @ fit.curve + fit.basis.below(nodes))
-    linear[nodes <= 0] = 0.0
+def _table(fit: CurveFit, nodes: Floats, step: float, white: float) -> tuple[Floats, Floats]:
+    """Radiance at stored values above the dark level, and its standard deviation; 1 at `white`."""
+    design = fit.basis.values(nodes) - fit.basis.values(np.array([white]))
     logarithm = design @ fit.curve
+    linear = np.minimum(np.exp(logarithm + fit.basis.below(nodes)), 1.0)
+    linear[nodes <= 0] = 0.0
     variance = np.einsum("nq,qr,nr->n", design, fit.covariance, design) + (fit.power_sigma * logarithm) ** 2
     rounding = _ROUNDING * step / np.maximum(nodes, step) * (fit.basis.slopes(nodes) @ fit.curve)
     sigma = linear * np.sqrt(np.maximum(variance, 0.0) + rounding**2)
@@ -290,6 +292,7 @@ def _by_channel(
     unclipped: NDArray[np.bool_],
     kept: list[int],
     low: float,
+    black: Floats,
     warnings: list[str],
 ) -> tuple[Floats, Floats]:
     """One curve for all channels where they agree, else one for each."""
@@ -300,7 +303,7 @@ def _by_channel(
         fit = solve_curve(
             choose_frames(groups, kept), stored[kept], seen[kept], unclipped[kept], [channel], low
         )
-        tables.append(_table(fit, nodes, groups.step))
+        tables.append(_table(fit, nodes, groups.step, 1.0 - float(black[channel])))
     inside = (nodes > max(covered[0], 0.05)) & (nodes < covered[1])
     each = np.stack([table for table, _ in tables], axis=1)
     each_sigma = np.stack([sigma_c for _, sigma_c in tables], axis=1)

@@ -16,7 +16,7 @@ from calib.stills import read_stills
 from capture.errors import SourceError
 from capture.images import write_jpeg, write_png
 from capture.sim.sensor import SensorConfig
-from capture.transfer import to_linear
+from capture.transfer import to_display, to_linear
 from relight.cli import main
 
 TIMES_S = np.geomspace(1 / 2000, 1 / 15, 10)
@@ -95,6 +95,34 @@ def test_an_exposure_that_is_not_what_it_says_is_named_and_left_out(wrong):
     assert frame.off == pytest.approx(wrong[1] - 1, abs=0.012)
     assert frame.name in result.warnings[0]
     assert np.abs(errors_of(result, "srgb")[0]).max() < 0.006
+
+
+def test_a_dark_level_that_is_known_is_taken_off():
+    rng = np.random.default_rng(1)
+    radiance, sensor, pedestal = scene(rng), SensorConfig(seed=1), 0.06
+    frames = []
+    for k, time_s in enumerate(TIMES_S):
+        light = radiance * time_s * 60
+        noisy = light + sensor.noise_sigma(light) * rng.standard_normal(light.shape)
+        encoded = np.sign(noisy) * to_display(np.minimum(np.abs(noisy), 1.0), "srgb")
+        stored = np.clip(pedestal + (1 - pedestal) * encoded, 0, 1)
+        frames.append(SweepFrame(f"f{k}", time_s, np.rint(65535 * stored).astype(np.uint16)))
+    result = fit_response(gather_groups(frames), np.full(3, pedestal))
+    measured = (result.stored > 0.03) & (result.stored < result.covered[1])
+    truth = to_linear(result.stored / (1 - pedestal), "srgb")
+    assert np.abs(result.linear - truth)[measured].max() < 0.005  # as without a dark level
+    assert np.interp(1 - pedestal, result.stored, result.linear) == pytest.approx(1.0, abs=1e-3)
+
+
+def test_a_part_that_moves_is_left_out():
+    frames = []
+    for k, frame in enumerate(sweep("srgb")):
+        image = frame.image.copy()
+        image[:, :40] = np.roll(image[:, :40], 9 * k, axis=0)
+        frames.append(SweepFrame(frame.name, frame.exposure_s, image))
+    result = fit_response(gather_groups(frames))
+    assert 0.05 < result.moved < 0.25
+    assert np.abs(errors_of(result, "srgb")[0]).max() < 0.005
 
 
 def test_channels_with_different_curves_get_one_each():
