@@ -22,10 +22,13 @@ from calib.flash_model import Light, log_light, log_light_with_slopes
 
 Floats = NDArray[np.float64]
 
+# A board that moves by less stood still (radians; share of its distance): some ten times the error of a pose.
+_STILL_TURN, _STILL_MOVE = np.radians(1.0), 0.004
+
 
 @dataclass(frozen=True, eq=False)
 class LitBoard:
-    """The light of one pulse on the white squares of one board.
+    """The light of one pulse, or the mean of several, on the white squares of one board.
 
     Attributes:
         name: of the picture with the flash.
@@ -116,6 +119,44 @@ class Stack:
                 )
             ),
         )
+
+
+def merged_stills(boards: Sequence[LitBoard]) -> list[LitBoard]:
+    """Pulses that follow each other on a board that stood still become one: the mean of their light.
+
+    Their poses have the same error, and their squares the same paper: they are no new evidence of these.
+    """
+    groups: list[list[LitBoard]] = []
+    for board in boards:
+        if groups and _still(groups[-1][0], board):
+            groups[-1].append(board)
+        else:
+            groups.append([board])
+    return [_mean_of(group) if len(group) > 1 else group[0] for group in groups]
+
+
+def _still(one: LitBoard, other: LitBoard) -> bool:
+    turned = float(np.arccos(np.clip(one.normal_cam @ other.normal_cam, -1, 1)))
+    moved = float(np.linalg.norm(one.origin_cam - other.origin_cam) / np.linalg.norm(one.origin_cam))
+    common = np.intersect1d(one.squares, other.squares)
+    return turned < _STILL_TURN and moved < _STILL_MOVE and len(common) > 0.8 * len(one.squares)
+
+
+def _mean_of(group: Sequence[LitBoard]) -> LitBoard:
+    common = group[0].squares
+    for board in group[1:]:
+        common = np.intersect1d(common, board.squares)
+    parts = [board.part(np.isin(board.squares, common)) for board in group]
+    squared = np.mean([part.noise**2 for part in parts], axis=0)
+    return replace(
+        parts[0],
+        name=f"{group[0].name} and {len(group) - 1} more",
+        time_s=float(np.mean([part.time_s for part in parts])),
+        points_cam=np.mean([part.points_cam for part in parts], axis=0),
+        reach_cam=np.mean([part.reach_cam for part in parts], axis=0),
+        radiance=np.mean([part.radiance for part in parts], axis=0),
+        noise=np.sqrt(squared / len(parts)),
+    )
 
 
 def stacked(boards: Sequence[LitBoard], about: Light) -> Stack:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from calib.calibration import Calibration
 from calib.errors import FlashGeometryError
-from calib.flash_boards import LitBoard, stacked
+from calib.flash_boards import LitBoard, merged_stills, stacked
 from calib.flash_checks import (
     HeldOut,
     axis_sigma,
@@ -115,8 +115,9 @@ def calibrate_flash(
     pairs = collected.describe()
     check_poses(collected.boards, pairs)
     everything = np.arange(LIGHT_SIZE)
-    start, boards, lost = find_strangers(collected.boards, everything)
-    _check_strangers(collected.boards, boards, lost)
+    measured = merged_stills(collected.boards)
+    start, boards, lost = find_strangers(measured, everything)
+    _check_strangers(measured, boards, lost)
     check_poses(boards, pairs)
     progress("fit the flash", 0.3)
     stack = stacked(boards, start)
@@ -141,7 +142,7 @@ def calibrate_flash(
         gains=gains,
         gain_sigma=gain_sigma,
         held_out=held_out,
-        left_out=(lost, len(collected.boards) - len(boards)),
+        left_out=(lost, len(measured) - len(boards)),
         axis_known=axis_known,
         notes=[],
         pairs=pairs,

@@ -32,7 +32,7 @@ def flash_of(found: FlashGeometry, board: Board, source: str) -> Calibration:
         source: what was filmed, for the provenance.
     """
     about = (
-        f"{source}; {board.describe()}; {len(found.boards)} pulses on {poses_of(found)} poses, boards left "
+        f"{source}; {board.describe()}; {len(found.boards)} boards in {poses_of(found)} poses, boards left "
         f"out predicted to {100 * found.held_out.rms:.2f} %"
     )
     strength = (

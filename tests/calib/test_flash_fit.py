@@ -15,7 +15,7 @@ from scipy.stats import chi2
 from calib.board import Board
 from calib.calibration import Calibration
 from calib.errors import FlashGeometryError
-from calib.flash_boards import LitBoard, stacked
+from calib.flash_boards import LitBoard, merged_stills, stacked
 from calib.flash_checks import check_fit, check_poses, distinct_poses, hold_out, weak_directions
 from calib.flash_fit import fit_light, pulse_gains
 from calib.flash_geometry import calibrate_flash
@@ -148,6 +148,29 @@ def test_boards_left_out_are_predicted_as_expected_and_a_wrong_model_is_told():
     assert 0.6 * check.expected < check.rms < 1.4 * check.expected
     claimed = replace(fit, spread=replace(fit.spread, texture=0.0003, pulse=0.001))
     assert not hold_out(kept, claimed).agrees
+
+
+def test_pulses_on_a_board_that_stood_still_are_not_taken_for_new_poses():
+    rng = np.random.default_rng(14)
+    boards = make_boards(rng, 10)
+    often = [
+        replace(
+            board,
+            name=f"{board.name}.{pulse}",
+            time_s=board.time_s + 0.2 * pulse,
+            radiance=board.radiance * (1 + 0.01 * rng.normal()),
+        )
+        for board in boards
+        for pulse in range(4)
+    ]
+    merged = merged_stills(often)
+    assert [board.name for board in merged[:2]] == ["pulse 0.0 and 3 more", "pulse 1.0 and 3 more"]
+    assert merged[0].time_s == pytest.approx(0.3)
+    once = calibrate_flash(CollectedBoards(boards, 10), Calibration())
+    found = calibrate_flash(CollectedBoards(often, 40), Calibration())
+    assert len(found.boards) == 10
+    # Four pulses on each of ten poses leave the poses' errors: forty boards would claim half of it.
+    assert (found.position_sigma_m > 0.75 * once.position_sigma_m).all()
 
 
 def test_each_pulse_has_its_gain():

@@ -180,7 +180,7 @@ def test_a_folder_of_pairs_becomes_a_flash_within_its_uncertainty(tmp_path, pair
         quantity = getattr(found, name)
         assert (np.abs(quantity.value - truth) < 4 * quantity.sigma + 1e-6).all(), (name, quantity)
         assert (quantity.sigma < largest[name]).all(), (name, quantity.sigma)
-        assert "10 pulses on 10 poses" in quantity.source
+        assert "10 boards in 10 poses" in quantity.source
     evidence = json.loads(flash_evidence_path(tmp_path / "out.json").read_text())
     assert np.array(evidence["covariance"]).shape == (8, 8)
     assert len(evidence["pulses"]) == 10

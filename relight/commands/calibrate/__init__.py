@@ -12,13 +12,13 @@ _PARTS = {
         "relight.commands.calibrate.intrinsics",
         "focal length, centre and distortion from pictures of a board",
     ),
-    "flash": ("relight.commands.calibrate.flash", "where the flash is and how it shines, from a lit board"),
     "response": (
         "relight.commands.calibrate.response",
         "stored values to linear radiance, from an exposure sweep",
     ),
     "dark": ("relight.commands.calibrate.dark", "dark level and noise, from dark pictures and from pairs"),
     "flat": ("relight.commands.calibrate.flat", "the lens' fall-off to the corners, from an even surface"),
+    "flash": ("relight.commands.calibrate.flash", "where the flash is and how it shines, from a lit board"),
     "convert": (
         "relight.commands.calibrate.convert",
         "intrinsics from or for OpenCV, ROS, COLMAP, Kalibr or mrcal",
@@ -28,7 +28,8 @@ _PARTS = {
 EXAMPLE = (
     "relight calibrate board --out board.pdf\n"
     "  relight calibrate intrinsics VID_20261102_101530.mp4 --board board.json --out calibration.json\n"
-    "  relight calibrate response --camera /dev/video0 --out calibration.json"
+    "  relight calibrate response --camera /dev/video0 --out calibration.json\n"
+    "  relight calibrate flash SESSION --board board.json --calibration calibration.json"
 )
 
 

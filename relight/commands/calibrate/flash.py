@@ -63,7 +63,7 @@ def run(args: argparse.Namespace) -> None:
     from capture.terminal import StageProgress
 
     board = load_board(args.board)
-    known_at = args.calibration or args.source / "calibration.json"
+    known_at = _file_of(args.calibration) if args.calibration else args.source / "calibration.json"
     if args.source.exists() and not known_at.is_file():
         raise FlashGeometryError(
             f"{known_at} does not exist; name the calibration.json with the camera's intrinsics "
@@ -112,7 +112,7 @@ def _describe(found: FlashGeometry) -> str:
     squares, pulses = found.left_out
     droop, droop_sigma = found.droop
     lines = [
-        f"boards      {len(found.boards)} pulses on {poses_of(found)} poses; left out: {squares} squares, "
+        f"light       {len(found.boards)} boards in {poses_of(found)} poses; left out: {squares} squares, "
         f"{pulses} pulses",
         f"place       {place} mm from the lens (right, down, forwards)",
         f"axis        {axis}",
