@@ -1,6 +1,6 @@
 """Tests with real kernel drivers: cameras and flashes that a kernel in a small virtual machine believes in.
 
-    python tests/vm/run.py [--folder build/vm] [--limit-s 360] [PART ...]
+    python tests/vm/run.py [--folder build/vm] [--limit-s 600] [PART ...]
 
 Each file `guest/check_PART.py` is run by pytest in the machine, in a process of its own, with the Python
 that runs this. Exit code 0: all passed, or the machine cannot be had here, which the last line then says
@@ -65,7 +65,7 @@ def _parser():
         "parts", nargs="*", metavar="PART", help=f"of {', '.join(_all_parts())}; without, all"
     )
     parser.add_argument("--folder", type=Path, default=Path("build/vm"), help="for packages, logs, results")
-    parser.add_argument("--limit-s", type=float, default=360.0, help="longest time for all")
+    parser.add_argument("--limit-s", type=float, default=600.0, help="longest time for all (default 600)")
     return parser
 
 
