@@ -154,7 +154,7 @@ def fit_response(groups: SweepGroups, dark: Floats | None = None) -> ResponseRes
     nodes = np.arange(256) / 255.0 if groups.step > 1e-3 else np.arange(1025) / 1024.0
     # What a clipped pixel is at once the dark level is off.
     linear, sigma = _table(fit, nodes, groups.step, 1.0 - float(black.mean()))
-    if len(channels) == 3:
+    if len(channels) == 3 and _channels_differ(fit):
         linear, sigma = _by_channel(
             linear, sigma, nodes, covered, groups, stored, seen, unclipped, kept, low, black, warnings
         )
@@ -279,6 +279,25 @@ def _table(fit: CurveFit, nodes: Floats, step: float, white: float) -> tuple[Flo
     rounding = _ROUNDING * step / np.maximum(nodes, step) * (fit.basis.slopes(nodes) @ fit.curve)
     sigma = linear * np.sqrt(np.maximum(variance, 0.0) + rounding**2)
     return np.maximum.accumulate(linear), sigma
+
+
+def _channels_differ(fit: CurveFit) -> bool:
+    """Whether the residuals of some channel about the common curve have a mean at some level."""
+    frames = len(fit.residuals)
+    residuals, fitted, robust = (
+        values.reshape(frames, -1, 3) for values in (fit.residuals, fit.fitted, fit.robust)
+    )
+    edges = np.linspace(0.0, 1.0, 11)
+    for channel in range(3):
+        good = np.isfinite(residuals[..., channel]) & (robust[..., channel] > 0.2)
+        levels, told = fitted[..., channel][good], residuals[..., channel][good]
+        for low, high in itertools.pairwise(edges):
+            inside = told[(levels >= low) & (levels < high)]
+            if len(inside) >= _LEAST_GROUPS:
+                error = float(inside.std()) / np.sqrt(len(inside))
+                if abs(inside.mean()) > max(_SAME_CURVE_SIGMAS * error, 0.5 * _SAME_CURVE):
+                    return True
+    return False
 
 
 def _by_channel(
