@@ -6,13 +6,17 @@ BIN := $(VENV)/bin
 # Made anew only when the dependencies change, so that a second `make test` starts at once.
 INSTALLED := $(VENV)/installed
 
-.PHONY: demo test lint clean
+.PHONY: demo test test-vm lint clean
 
 demo: $(INSTALLED)
 	$(BIN)/relight demo --out demo
 
 test: $(INSTALLED)
 	$(BIN)/python -m pytest -n 2
+
+# With the kernel's own drivers, in a small virtual machine; says SKIPPED where that cannot be had. Needs no root.
+test-vm: $(INSTALLED)
+	$(BIN)/python tests/vm/run.py
 
 lint: $(INSTALLED)
 	$(BIN)/ruff check .

@@ -26,7 +26,7 @@ def make_targets():
     """Target to its recipe lines."""
     targets, recipe = {}, []
     for line in (ROOT / "Makefile").read_text().splitlines():
-        if match := re.match(r"^([a-z]+):", line):
+        if match := re.match(r"^([a-z-]+):", line):
             recipe = targets.setdefault(match[1], [])
         elif line.startswith("\t"):
             recipe.append(line.strip())
@@ -34,7 +34,7 @@ def make_targets():
 
 
 def test_the_make_commands_of_the_readme_exist():
-    asked = set(re.findall(r"\bmake ([a-z]+)\b", (ROOT / "README.md").read_text()))
+    asked = set(re.findall(r"\bmake ([a-z-]+)", (ROOT / "README.md").read_text()))
     assert {"demo", "test"} <= asked
     assert asked <= set(make_targets())
 
