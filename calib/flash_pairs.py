@@ -210,8 +210,10 @@ def _linear(
     clipped = np.any(stored >= _CLIPPED * largest, axis=2)
     if dark is None or not dark.any():
         return LinearPicture(name, stored, response.to_linear(stored), clipped)
-    above = np.maximum(stored / largest - dark, 0.0)
-    return LinearPicture(name, stored, response.to_linear(above), clipped)
+    # Noise below the dark level stays negative: cut off, it would leave light in a dark room.
+    above = stored / largest - dark
+    radiance = np.copysign(response.to_linear(np.abs(above)), above).astype(np.float32)
+    return LinearPicture(name, stored, radiance, clipped)
 
 
 def _equally_exposed(first: FrameRecord, second: FrameRecord) -> bool:

@@ -327,6 +327,17 @@ def test_what_is_missing_is_named(tmp_path, capsys, prepare, words):
     assert words in capsys.readouterr().err.strip().splitlines()[-1]
 
 
+def test_a_dark_room_is_dark_on_average_once_the_dark_level_is_off(tmp_path):
+    rng = np.random.default_rng(1)
+    for name in ("0_flash", "0_noflash"):
+        noise = rng.normal(10.0, 3.0, (100, 100, 3))
+        write_png(tmp_path / f"{name}.png", np.rint(noise).clip(0, 255).astype(np.uint8))
+    known = Calibration(dark=Quantity.of([10 / 255] * 3, "1", "truth"))
+    (pair,) = open_pairs(tmp_path, known, "linear").pairs()
+    # The mean of 30000 pixels of 3 codes is known to 0.02; cut off at black it would be 1.2 codes.
+    assert abs(255 * pair.unlit.radiance.mean()) < 0.08
+
+
 def test_a_source_that_is_not_there_is_named(tmp_path, capsys):
     save_board(BOARD, tmp_path / "board.json")
     assert main(["calibrate", "flash", "nowhere", "--board", str(tmp_path / "board.json")]) == 1
