@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 
 from capture.atomic import atomic_write
@@ -40,8 +41,9 @@ class EdgeLog:
             raise SessionError(f"{self.path} cannot be written: {cause.strerror or cause}.") from cause
 
     def close(self) -> None:
-        """Closes the file."""
-        self._file.close()
+        """Closes the file; lines that could not be written are given up, `append` has told."""
+        with suppress(OSError):
+            self._file.close()
 
 
 def read_edges(session: Path) -> list[FlashEdge]:

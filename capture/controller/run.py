@@ -52,7 +52,8 @@ class CaptureOutcome:
 
     Attributes:
         session: With every frame that was taken.
-        stopped: Why it ended before its time, a sentence; None = it went to its end, or a signal ended it.
+        stopped: Why it ended before its time, or is of no use, a sentence; None = it is whole, or a signal
+            ended it.
         signal: Name of the signal that ended it; None = none did.
         warnings: What a person should know, a sentence each.
     """
@@ -96,10 +97,18 @@ def run_capture(
         session = capture.resume(Path(out)) if resume else capture.create(Path(out))
         with session, Interrupts() as interrupts:
             stopped = capture.record(session, interrupts)
-            capture.finish(session, stopped, interrupts.received)
+            stopped = _finished(capture, session, stopped, interrupts.received)
         return CaptureOutcome(session, stopped, interrupts.received, tuple(capture.warnings))
     finally:
         flash.off()
+
+
+def _finished(capture: _Capture, session: Session, stopped: str | None, signal: str | None) -> str | None:
+    """See `_Capture.finish`; why it stopped is told even when that cannot be written down."""
+    try:
+        return capture.finish(session, stopped, signal)
+    except SessionError as error:
+        raise SessionError(stopped or f"{error} Make room on the disk, and tag it with --resume.") from error
 
 
 class _Capture:
@@ -159,7 +168,9 @@ class _Capture:
                 sink.drain()
                 self._counts.waits = sink.waits
         except SessionError as error:
-            stopped = str(error)
+            stopped = (
+                f"{error} What was taken before it is kept; make room on the disk and go on with --resume."
+            )
         finally:
             edges.close()
             self._counts.end(self._clock.now_s(), time.process_time())
@@ -167,8 +178,12 @@ class _Capture:
             self._warn("The flash has not confirmed that it is off: look at it, and unplug it if it burns.")
         return stopped
 
-    def finish(self, session: Session, stopped: str | None, signal: str | None) -> None:
-        """Tags, chooses the frames that keep their pictures, writes the report, closes the session."""
+    def finish(self, session: Session, stopped: str | None, signal: str | None) -> str | None:
+        """Tags, chooses the frames that keep their pictures, writes the report, closes the session.
+
+        Returns:
+            Why it is no whole capture, if no signal is the reason: `stopped`, or that no flash was found.
+        """
         result: StreamResult | None = None
         self._tagger.shutdown()
         if self._tagging is not None:
@@ -176,10 +191,17 @@ class _Capture:
         if (rest := self._looker.finish()) is not None:
             self._tags.update(rest[0])
             result = rest[1]
-            for sentence in result.warnings:
-                self._warn(sentence)
             if result.refused is None:
                 apply_tags(session, self._tags, self._config)
+            elif stopped is None and signal is None:
+                stopped = result.refused
+            for sentence in result.warnings:
+                if sentence != stopped:
+                    self._warn(sentence)
+        elif stopped is None and signal is None:
+            stopped = (
+                "The camera has given no frame; try it with its own program, or name another (--camera)."
+            )
         save_scene(session, self._camera, self._poses)
         for sentence in self._left_behind():
             self._warn(sentence)
@@ -187,8 +209,8 @@ class _Capture:
             capture=capture_report(self._flash, self._counts, result, stopped or signal),
             warnings=[*session.info.get("warnings", []), *self.warnings],
         )
-        whole = stopped is None and signal is None and result is not None and result.refused is None
-        session.finish("complete" if whole else "interrupted")
+        session.finish("complete" if stopped is None and signal is None else "interrupted")
+        return stopped
 
     def _take_frames(
         self, folder: Path, sink: FrameSink, edges: EdgeLog, interrupts: Interrupts

@@ -160,7 +160,7 @@ class Commands:
         Args:
             on_s: [P] starts of pulses, increasing.
         """
-        if not self.can_tell(len(on_s)):
+        if min(len(self.times_s), len(on_s)) < self._least:
             return None
         found: tuple[int, float, NDArray[np.int_], float] | None = None
         for start_s in self._offsets(on_s):
@@ -185,8 +185,9 @@ class Commands:
         return _LEAST_LOCKED if self.offset_s is None else 1
 
     def can_tell(self, pulses: int) -> bool:
-        """Whether so many pulses are enough to say whether the two agree."""
-        return min(len(self.times_s), pulses) >= self._least
+        """Whether so many pulses are enough to say whether the two agree; too few of them are a no."""
+        expected = len(self.times_s)
+        return expected >= self._least and (pulses >= self._least or pulses < _LEAST_MATCHED * expected)
 
     def _offsets(self, on_s: Floats) -> list[float]:
         if self.offset_s is not None:

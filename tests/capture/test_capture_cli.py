@@ -91,6 +91,15 @@ def test_what_goes_wrong_is_one_sentence_and_code_one(typed, flash, camera, says
     assert "Traceback" not in err
 
 
+def test_a_capture_in_which_no_flash_is_found_is_no_success(typed, tmp_path):
+    """Too short for the rule that stops it: nothing is said until the tags are made."""
+    camera = "fake-v4l2:width=160;height=120"
+    code, _, err = typed("--flash", "sim:missed=1", "--camera", camera, "--duration", "3", "--quiet")
+    assert code == 1
+    assert err.count("lit and unlit") == 1
+    assert Session.open(tmp_path / "S").status == "interrupted"
+
+
 def test_resuming_needs_a_session_to_go_on_with(typed, tmp_path):
     code, _, err = typed("--flash", "sim:", "--camera", "sim:coarse", "--resume", "--quiet")
     assert code == 1

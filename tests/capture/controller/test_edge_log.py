@@ -1,5 +1,7 @@
 """The flash's edges beside the frames, when a capture was killed."""
 
+from pathlib import Path
+
 import pytest
 
 from capture.controller.edge_log import EdgeLog, drop_edges_after, read_edges
@@ -33,3 +35,12 @@ def test_a_spoilt_line_is_named(tmp_path):
     (tmp_path / "flash.jsonl").write_text("nonsense\n{}\n")
     with pytest.raises(SessionError, match="line 1 is no edge"):
         drop_edges_after(tmp_path, 1.0)
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="only Linux has a disk that is always full")
+def test_on_a_full_disk_it_says_so_once(tmp_path):
+    (tmp_path / "flash.jsonl").symlink_to("/dev/full")
+    log = EdgeLog(tmp_path)
+    with pytest.raises(SessionError, match="No space left"):
+        log.append([edge(1.0)])
+    log.close()

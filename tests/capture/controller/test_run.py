@@ -193,6 +193,18 @@ def test_it_stops_when_the_disk_is_full_all_the_same(desk, monkeypatch):
     assert session.repairs == []
 
 
+def test_a_full_disk_is_told_even_where_the_tags_find_no_room(desk, monkeypatch):
+    def full(self, *args, **kwargs):
+        raise SessionError(f"{self.path}: No space left on device.")
+
+    monkeypatch.setattr(Session, "replace_frames", full)
+    with pytest.raises(SessionError, match="Make room on the disk, and tag it with --resume"):
+        desk.capture(duration_s=3.0)
+    with pytest.raises(SessionError, match="unplugged"):
+        desk.capture("sim:coarse;unplug_s=3", out=desk.folder / "T")
+    assert desk.dark
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_it_in_good_order(desk, number):
     spy = Spy(100, lambda: os.kill(os.getpid(), number))

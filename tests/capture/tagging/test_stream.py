@@ -186,6 +186,13 @@ def test_a_schedule_of_another_flash_is_not_believed():
     assert any("does not fit" in text or "not in the frames" in text for text in result.warnings)
 
 
+def test_a_capture_of_two_pulses_does_not_contradict_its_schedule():
+    frames = filmed(QUIET)[:75]
+    assert sum(len(frame.events) for frame in frames) in (2, 3)
+    _, result = streamed(frames, schedule=True)
+    assert not any("does not fit" in text for text in result.warnings)
+
+
 def test_pulses_are_counted_while_they_come():
     tagger = StreamTagger(COLUMNS, ROWS, config=CONFIG)
     for frame in filmed(QUIET)[:200]:
