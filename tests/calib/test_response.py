@@ -14,7 +14,9 @@ from calib.response_fit import fit_response
 from calib.response_groups import SweepFrame, gather_groups, grouped_median
 from calib.stills import read_stills
 from capture.errors import SourceError
+from capture.frame_record import FrameRecord
 from capture.images import write_jpeg, write_png
+from capture.session import Session
 from capture.sim.sensor import SensorConfig
 from capture.transfer import to_display, to_linear
 from relight.cli import main
@@ -219,6 +221,22 @@ def test_a_folder_with_a_list_becomes_a_response(tmp_path, capsys):
     evidence = json.loads((tmp_path / "calibration.response.json").read_text())
     assert len(evidence["frames"]) == 10
     assert len(evidence["sigma"]) == 256
+
+
+def test_a_session_s_own_exposures_count_and_the_response_goes_into_it(tmp_path):
+    frames = sweep("srgb")
+    height, width = frames[0].image.shape[:2]
+    path = tmp_path / "session"
+    with Session.create(path, source={"kind": "test"}, width=width, height=height) as session:
+        for index, frame in enumerate(frames):
+            file = session.write_frame(index, frame.image)
+            session.append_frame(
+                FrameRecord(index=index, file=file, width=width, height=height, exposure_s=frame.exposure_s)
+            )
+    assert main(["calibrate", "response", str(path), "--out", str(path)]) == 0
+    session = Session.open(path)
+    radiance = session.load_radiance(session.frames[5])
+    assert np.abs(radiance - to_linear(frames[5].image, "srgb")).max() < 0.006
 
 
 def test_a_camera_is_driven_through_its_sweep(tmp_path, capsys):
