@@ -24,6 +24,7 @@ def rehearse(camera_url: str, flash_url: str, profile: CameraProfile, on_s: floa
 
     Raises:
         DeviceError: A device cannot be opened or locked.
+        KeyboardInterrupt: A signal has ended it.
     """
     config = CaptureConfig(duration_s=_SECONDS, on_s=on_s, profile=profile, restore=True)
     bench = open_bench(camera_url, flash_url, _SECONDS)
@@ -35,12 +36,14 @@ def rehearse(camera_url: str, flash_url: str, profile: CameraProfile, on_s: floa
         outcome = run_capture(camera, flash, bench, Path(folder) / "rehearsal", config)
         info = outcome.session.info
         fps = camera.format.fps
+    if outcome.signal is not None:
+        raise KeyboardInterrupt
     findings = [_of_control(control) for control in info["device"]["controls"]]
     findings += _of_frames(info["capture"])
     findings += _of_light(info["capture"], on_s, fps)
-    if outcome.stopped is not None:
-        findings.append(Finding("rehearsal", Level.BAD, outcome.stopped))
     said = {finding.sentence for finding in findings}
+    if outcome.stopped is not None and outcome.stopped not in said:
+        findings.append(Finding("rehearsal", Level.BAD, outcome.stopped))
     findings += [
         Finding("rehearsal", Level.NOTE, sentence) for sentence in outcome.warnings if sentence not in said
     ]

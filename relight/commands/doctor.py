@@ -40,14 +40,29 @@ def run(args: argparse.Namespace) -> None:
     if args.udev:
         print(udev_rules(), end="")
         return
+    _check(args)
     findings = _look(args)
     _print(findings)
     if args.json:
         content = json.dumps([finding.to_json() for finding in findings], indent=2, ensure_ascii=False) + "\n"
-        atomic_write(args.json, content.encode())
+        try:
+            atomic_write(args.json, content.encode())
+        except OSError as cause:
+            raise DoctorError(f"{args.json} cannot be written: {cause.strerror or cause}.") from cause
     bad = [finding for finding in findings if finding.level == "bad"]
     if bad:
         raise DoctorError(f"{len(bad)} of {len(findings)} findings are bad; the first: {bad[0].sentence}")
+
+
+def _check(args: argparse.Namespace) -> None:
+    """Whether the numbers can be, before anything is looked at."""
+    from capture.controller.config import CaptureConfig
+    from capture.devices.camera import CameraProfile
+
+    try:
+        CaptureConfig(on_s=args.on, profile=CameraProfile(exposure_s=args.exposure))
+    except ValueError as wrong:
+        raise DoctorError(f"{wrong}.") from wrong
 
 
 def _look(args: argparse.Namespace) -> list[Finding]:
@@ -71,8 +86,7 @@ def _look(args: argparse.Namespace) -> list[Finding]:
     from capture.devices.camera import CameraProfile
     from capture.doctor.rehearsal import rehearse
 
-    profile = CameraProfile(exposure_s=args.exposure)
-    return findings + rehearse(args.camera, args.flash, profile, args.on)
+    return findings + rehearse(args.camera, args.flash, CameraProfile(exposure_s=args.exposure), args.on)
 
 
 def _print(findings: list[Finding]) -> None:

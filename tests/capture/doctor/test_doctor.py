@@ -3,11 +3,12 @@
 import importlib.metadata
 import json
 from collections import namedtuple
+from dataclasses import replace
 
 import pytest
 
 from capture.devices.camera import CameraProfile
-from capture.doctor import permissions
+from capture.doctor import permissions, rehearsal
 from capture.doctor.devices import look_at_devices
 from capture.doctor.disk import look_at_disk
 from capture.doctor.finding import Finding, Level
@@ -146,3 +147,36 @@ def test_the_command_ends_with_an_error_exactly_when_something_is_bad(capsys, tm
     assert "1 of 3 findings are bad; the first: no room" in seen.err
     assert main(["doctor", "--udev"]) == 0
     assert "27b8" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["--on", "5"], "on_s is 5.0; it must be positive, at most 0.25 s"),
+        (["--on", "nan"], "on_s is nan"),
+        (["--exposure", "-1"], "exposure_s is -1.0"),
+    ],
+)
+def test_numbers_that_cannot_be_are_told(arguments, says, capsys, tmp_path, monkeypatch):
+    monkeypatch.setattr("capture.doctor.disk._frames_hz", lambda folder: 100.0)
+    devices = ["--camera", "sim:coarse", "--flash", "sim:"]
+    assert main(["doctor", *devices, *arguments, "--out", str(tmp_path)]) == 1
+    assert says in capsys.readouterr().err
+
+
+def test_a_report_that_cannot_be_written_is_named_as_it_was_typed(capsys, tmp_path, monkeypatch):
+    monkeypatch.setattr("capture.doctor.disk._frames_hz", lambda folder: 100.0)
+    missing = tmp_path / "missing" / "found.json"
+    assert main(["doctor", "--out", str(tmp_path), "--json", str(missing)]) == 1
+    assert f"{missing} cannot be written" in capsys.readouterr().err
+
+
+def test_ctrl_c_in_a_rehearsal_ends_it(monkeypatch):
+    run = rehearsal.run_capture
+
+    def interrupted(*args):
+        return replace(run(*args), signal="SIGINT")
+
+    monkeypatch.setattr(rehearsal, "run_capture", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        rehearse("fake-v4l2:width=160;height=120", "sim:", CameraProfile(), 0.1)
