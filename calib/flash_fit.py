@@ -92,6 +92,29 @@ def pulse_gains(stack: Stack, fit: LightFit) -> tuple[Floats, Floats]:
     return gains, 1.0 / np.sqrt(precision)
 
 
+def light_exponent(stack: Stack, fit: LightFit) -> tuple[float, float]:
+    """By which power of the predicted light the measured one grows, and its standard deviation: 1 if all is
+    well.
+
+    A response that is wrong, light that is not the flash's, or paper that is not matte bend the light, and
+    place and falloff follow as far as they can; what they cannot follow is seen here (one step from 1, with
+    everything else free).
+    """
+    roots = _error_roots(stack, fit.light, fit.spread)
+    level = log_light(fit.light, stack.points_cam, stack.normals_cam, stack.time)
+    bent = np.where(stack.there, level - level[stack.there].mean(), 0.0)
+    slopes = light_slopes(stack, fit.light, np.arange(LIGHT_SIZE))
+    columns = (roots @ np.concatenate([bent[..., None], slopes], axis=2)).reshape(-1, 1 + LIGHT_SIZE)
+    off = (roots @ relative_residuals(stack, fit.light)[..., None]).ravel()
+    prior = np.zeros((AXIS.stop - AXIS.start, 1 + LIGHT_SIZE))
+    prior[:, 1:] = prior_slopes(np.arange(LIGHT_SIZE))
+    columns = np.vstack([columns, prior])
+    off = np.append(off, -prior[:, 1:] @ fit.light.vector)
+    covariance = np.linalg.pinv(columns.T @ columns, hermitian=True)
+    change = covariance @ (columns.T @ off)
+    return 1.0 + float(change[0]), float(np.sqrt(covariance[0, 0]))
+
+
 def bounds_of(free: NDArray[np.int64]) -> tuple[Floats, Floats]:
     """[p] and [p] between which the free numbers are sought."""
     low, high = np.full(LIGHT_SIZE, -np.inf), np.full(LIGHT_SIZE, np.inf)

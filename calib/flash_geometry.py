@@ -25,7 +25,7 @@ from calib.flash_checks import (
     hold_out,
     weak_directions,
 )
-from calib.flash_fit import LightFit, fit_light, pulse_gains
+from calib.flash_fit import LightFit, fit_light, light_exponent, pulse_gains
 from calib.flash_model import AXIS, DROOP, FALLOFF, LIGHT_SIZE, LOG_STRENGTH, Light
 from calib.flash_samples import CollectedBoards
 from calib.flash_strangers import find_strangers
@@ -39,6 +39,8 @@ _MOST_STRANGE_SQUARES, _MOST_STRANGE_PULSES = 0.2, 0.34
 _DOUBTFUL_AXIS = np.radians(15.0)
 _SURE = 3.0  # standard deviations from which a droop is one
 _UNSTEADY = 0.03
+# A light that grows with another power than 1 moves the flash: by some 15 mm for 0.05.
+_DOUBTFUL_EXPONENT, _WRONG_EXPONENT = 0.015, 0.08
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +56,7 @@ class FlashGeometry:
         gains: [V] how much brighter each pulse was than the trend, relative; and `gain_sigma` [V].
         gain_sigma: [V].
         held_out: how boards left out are predicted.
+        exponent: power of the predicted light with which the measured one grows, and its standard deviation.
         left_out: (squares, pulses) that do not belong.
         axis_known: whether the axis was determined; else it is taken along the optical axis.
         notes: what a user must know, one sentence each.
@@ -68,6 +71,7 @@ class FlashGeometry:
     gains: Floats
     gain_sigma: Floats
     held_out: HeldOut
+    exponent: tuple[float, float]
     left_out: tuple[int, int]
     axis_known: bool
     notes: list[str]
@@ -128,6 +132,13 @@ def calibrate_flash(
         vector[AXIS] = 0.0
         fit = fit_light(stack, Light(vector), np.setdiff1d(everything, np.arange(AXIS.start, AXIS.stop)))
     check_fit(fit, boards)
+    exponent, exponent_sigma = light_exponent(stack, fit)
+    if abs(exponent - 1.0) > max(_SURE * exponent_sigma, _WRONG_EXPONENT):
+        raise FlashGeometryError(
+            f"The light on the board grows with the power {exponent:.2f} ± {exponent_sigma:.2f} of what a "
+            "small flash sends onto matte paper, not with its first: place and falloff would be wrong. "
+            "Calibrate the response (or name the transfer function), keep other light constant, and use a matte board."
+        )
     progress("fit the flash", 0.6)
     held_out = hold_out(boards, fit)
     progress("fit the flash", 1.0)
@@ -142,6 +153,7 @@ def calibrate_flash(
         gains=gains,
         gain_sigma=gain_sigma,
         held_out=held_out,
+        exponent=(exponent, exponent_sigma),
         left_out=(lost, len(measured) - len(boards)),
         axis_known=axis_known,
         notes=[],
@@ -206,6 +218,12 @@ def _notes(found: FlashGeometry, calibration: Calibration) -> list[str]:
             f"Boards left out are predicted to {100 * check.rms:.2f} %, and {100 * check.expected:.2f} % "
             "were expected: the uncertainties are too small. Is the paper matte and flat, and the response "
             "right?"
+        )
+    exponent, sigma = found.exponent
+    if abs(exponent - 1.0) > max(_SURE * sigma, _DOUBTFUL_EXPONENT):
+        notes.append(
+            f"The light grows with the power {exponent:.3f} ± {sigma:.3f} of that predicted: place and "
+            "falloff are off by more than is stated. Calibrate the response, and use a matte board."
         )
     droop, sigma = found.droop
     if abs(droop) > _SURE * sigma and abs(droop) > 0.01:

@@ -114,6 +114,7 @@ def flash_evidence(found: FlashGeometry, board: Board, source: str) -> dict[str,
             "expected": found.held_out.expected,
             "shape_rms": found.held_out.shape_rms,
         },
+        "light_exponent": {"value": found.exponent[0], "sigma": found.exponent[1]},
         "notes": found.notes,
         "pulses": pulses,
     }

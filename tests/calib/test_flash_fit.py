@@ -263,8 +263,27 @@ def test_light_that_is_no_near_flash_is_refused():
         replace(board, radiance=board.radiance * scale)
         for board, scale in zip(boards[4:], (0.2, 3, 0.3, 4, 0.2, 3, 0.3, 4), strict=True)
     ]
-    with pytest.raises(FlashGeometryError, match=r"not that of one small flash|known only to"):
+    with pytest.raises(
+        FlashGeometryError, match=r"not that of one small flash|known only to|grows with the power"
+    ):
         calibrate_flash(CollectedBoards(boards, 12), Calibration())
+
+
+@pytest.mark.parametrize("power", [0.8, 1.2])
+def test_a_wrong_response_is_refused_and_a_right_one_is_not_suspected(power):
+    boards = make_boards(np.random.default_rng(3), 14)
+    found = calibrate_flash(CollectedBoards(boards, 14), Calibration())
+    assert abs(found.exponent[0] - 1) < 3 * found.exponent[1] < 0.03
+    bent = [replace(board, radiance=board.radiance**power) for board in boards]
+    with pytest.raises(FlashGeometryError, match=r"grows with the power (0\.7|1\.1|1\.2)"):
+        calibrate_flash(CollectedBoards(bent, 14), Calibration())
+
+
+def test_a_response_that_is_a_little_wrong_is_noted():
+    boards = make_boards(np.random.default_rng(3), 16)
+    bent = [replace(board, radiance=board.radiance**1.05) for board in boards]
+    found = calibrate_flash(CollectedBoards(bent, 16), Calibration())
+    assert any("grows with the power 1.0" in note for note in found.notes)
 
 
 def test_an_impossible_albedo_is_refused():
