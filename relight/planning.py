@@ -87,7 +87,7 @@ def make_plan(
 
     return Plan(
         decisions=(
-            _frames(session.frames, fitted, left_out),
+            _frames(session, fitted, left_out),
             _flash(session.frames, fitted),
             found.poses,
             found.cloud,
@@ -128,10 +128,16 @@ def _select(
     return fitted, left_out
 
 
-def _frames(frames: list[FrameRecord], fitted: list[FrameRecord], left_out: Mapping[int, str]) -> Decision:
+def _frames(session: Session, fitted: list[FrameRecord], left_out: Mapping[int, str]) -> Decision:
     counts = Counter("same view as another" if "same view" in why else why for why in left_out.values())
     without = ", ".join(f"{count} {why.replace('_', ' ')}" for why, count in counts.most_common())
-    reason = f"{len(fitted)} of {len(frames)} frames" + (f"; left out: {without}" if without else "")
+    reason = f"{len(fitted)} of {len(session.frames)} frames" + (f"; left out: {without}" if without else "")
+    if (
+        not fitted
+        and session.info.get("source", {}).get("kind") == "capture"
+        and session.status != "complete"
+    ):
+        reason += "; the capture is not whole, go on with it: `relight-capture --resume`"
     return Decision("frames", Action.RUN if fitted else Action.REFUSE, reason)
 
 

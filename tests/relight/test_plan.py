@@ -250,3 +250,14 @@ def test_an_empty_session_is_refused(tmp_path):
     plan = make_plan(make_session(tmp_path / "s", flags=(), azimuths=(), poses=False))
     with pytest.raises(PlanError):
         plan.check()
+
+
+def test_a_capture_that_was_killed_is_to_be_gone_on_with(tmp_path):
+    session = make_session(tmp_path / "s", flags=(None,) * 4, poses=False)
+    session.info["source"], session.status = {"kind": "capture"}, "interrupted"
+    with pytest.raises(PlanError, match="relight-capture --resume"):
+        make_plan(session).check()
+    session.status = "complete"
+    with pytest.raises(PlanError) as refusal:
+        make_plan(session).check()
+    assert "--resume" not in str(refusal.value)
