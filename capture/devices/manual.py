@@ -109,8 +109,8 @@ class ManualFlash:
             )
         else:
             self._tell(
-                f"Switch the lamp on for {train.on_s:g} s every {train.period_s:g} s, {train.count} times; "
-                "it is not controlled from here."
+                f"Switch the lamp on for {train.on_s:.2g} s every {train.period_s:.3g} s, "
+                f"{train.count} times; it is not controlled from here."
             )
 
     def poll(self) -> tuple[FlashEdge, ...]:

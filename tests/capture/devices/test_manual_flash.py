@@ -27,6 +27,13 @@ def test_the_person_is_told_what_to_do_and_to_end_it():
     assert len(said) == 2
 
 
+def test_a_person_is_told_no_more_digits_than_a_hand_has():
+    said = []
+    with ManualFlash(tell=said.append) as flash:
+        flash.start(PulseTrain(start_s=1.0, period_s=1.01273333, on_s=0.1, count=5))
+    assert "0.1 s every 1.01 s, 5 times" in said[0]
+
+
 def test_a_lamp_that_blinks_by_itself_is_described_by_its_url(bench):
     flash = open_flash("manual:period=1;on=0.1", bench)
     assert flash.info.url == "manual:period=1;on=0.1"
