@@ -39,8 +39,8 @@ _MOST_STRANGE_SQUARES, _MOST_STRANGE_PULSES = 0.2, 0.34
 _DOUBTFUL_AXIS = np.radians(15.0)
 _SURE = 3.0  # standard deviations from which a droop is one
 _UNSTEADY = 0.03
-# A light that grows with another power than 1 moves the flash: by some 15 mm for 0.05.
-_DOUBTFUL_EXPONENT, _WRONG_EXPONENT = 0.015, 0.08
+# A light that grows with another power than 1 moves the flash: by some 3 to 9 mm for each 0.01.
+_DOUBTFUL_EXPONENT, _WRONG_EXPONENT = 0.01, 0.03
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +137,8 @@ def calibrate_flash(
         raise FlashGeometryError(
             f"The light on the board grows with the power {exponent:.2f} ± {exponent_sigma:.2f} of what a "
             "small flash sends onto matte paper, not with its first: place and falloff would be wrong. "
-            "Calibrate the response (or name the transfer function), keep other light constant, and use a matte board."
+            "Calibrate the response (or name the transfer function), keep other light constant, and "
+            "use a matte board."
         )
     progress("fit the flash", 0.6)
     held_out = hold_out(boards, fit)

@@ -281,7 +281,7 @@ def test_a_wrong_response_is_refused_and_a_right_one_is_not_suspected(power):
 
 def test_a_response_that_is_a_little_wrong_is_noted():
     boards = make_boards(np.random.default_rng(3), 16)
-    bent = [replace(board, radiance=board.radiance**1.05) for board in boards]
+    bent = [replace(board, radiance=board.radiance**1.025) for board in boards]
     found = calibrate_flash(CollectedBoards(bent, 16), Calibration())
     assert any("grows with the power 1.0" in note for note in found.notes)
 
