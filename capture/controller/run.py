@@ -32,6 +32,7 @@ from capture.errors import (
     CameraError,
     CameraTimeoutError,
     DeviceError,
+    FlashError,
     SessionError,
 )
 from capture.session import FrameRecord, Session
@@ -89,8 +90,10 @@ def run_capture(
         The session, and how it ended. All that was taken is in it, tagged as far as it can be.
 
     Raises:
-        CaptureError: Before the first frame: the camera cannot be locked, the folder is in use.
+        CaptureError: Before the first frame: the camera cannot be locked, the folder is in use, the flash
+            cannot do what is asked for.
     """
+    _check_dimming(flash, config)
     try:
         lock = camera.lock(config.profile)
         capture = _Capture(camera, flash, bench, config, lock, watch)
@@ -101,6 +104,12 @@ def run_capture(
         return CaptureOutcome(session, stopped, interrupts.received, tuple(capture.warnings))
     finally:
         flash.off()
+
+
+def _check_dimming(flash: FlashDevice, config: CaptureConfig) -> None:
+    """Refuses before a folder is made what the flash would refuse after it."""
+    if config.level < 1 and not flash.capabilities.dimmable:
+        raise FlashError(f"{flash.info.name} cannot dim its light to {config.level:g}; leave out --level.")
 
 
 def _finished(capture: _Capture, session: Session, stopped: str | None, signal: str | None) -> str | None:

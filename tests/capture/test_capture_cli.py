@@ -100,6 +100,13 @@ def test_a_capture_in_which_no_flash_is_found_is_no_success(typed, tmp_path):
     assert Session.open(tmp_path / "S").status == "interrupted"
 
 
+def test_a_lamp_that_cannot_dim_is_told_before_a_folder_is_made(typed, tmp_path):
+    code, _, err = typed("--flash", "manual:", "--camera", "sim:coarse", "--level", "0.5", "--quiet")
+    assert code == 1
+    assert "cannot dim its light to 0.5" in err
+    assert not (tmp_path / "S").exists()
+
+
 def test_resuming_needs_a_session_to_go_on_with(typed, tmp_path):
     code, _, err = typed("--flash", "sim:", "--camera", "sim:coarse", "--resume", "--quiet")
     assert code == 1
