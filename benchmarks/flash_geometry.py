@@ -3,7 +3,7 @@
     python -m benchmarks.flash_geometry --out benchmarks/results/flash_geometry.json
 
 Each set has a board of 0.15 x 0.21 m at 0.25 to 0.6 m; squares with 0.3 % noise and 0.3 % texture, pulses
-that differ by 1 %, corners found to 0.1 px. The sets are those of the tests (`tests/calib/test_flash_fit.py`).
+that differ by 1 %, corners found to 0.1 px. The sets are those of `tests/calib/test_flash_fit.py`.
 """
 
 from __future__ import annotations
