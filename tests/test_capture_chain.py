@@ -16,7 +16,7 @@ SECONDS = 6
 
 @pytest.fixture(scope="module", params=["simavr", "host"])
 def captured(request, tmp_path_factory):
-    """Session, and the lamp's edges by CLOCK_MONOTONIC: the chip's image in simavr, or the same C on the host."""
+    """Session, and the lamp's edges by CLOCK_MONOTONIC: the chip's image in simavr, or the C on the host."""
     base = tmp_path_factory.getbasetemp()
     programs = (base.parent if base.name.startswith("popen-") else base) / "flash_doubles"
     work = tmp_path_factory.mktemp("chain")
