@@ -8,6 +8,8 @@ from dataclasses import dataclass, field
 from capture.devices.camera import CameraProfile
 from capture.devices.flash import LONGEST_ON_S, MOST_PULSES, SHORTEST_PERIOD_S
 
+_ROUNDING = 1e-6  # of frames
+
 
 @dataclass(frozen=True, kw_only=True)
 class CaptureConfig:
@@ -16,9 +18,10 @@ class CaptureConfig:
     Attributes:
         duration_s: From the first frame that is recorded to the last.
         period_s: From one flash to the next, before `phase_step`.
-        phase_step: Share of a frame period by which each flash comes later than that. A camera of 30 frames
-            and a lamp of one flash a second are in step for minutes: all flashes would begin at the same row,
-            most rows would never tell an edge, and the shutter could not be fitted. 0 = exactly in step.
+        phase_step: Share of a frame period by which each flash begins later in its frame than the one before.
+            A camera of 30 frames and a lamp of one flash a second are in step for minutes: all flashes would
+            begin at the same row, most rows would never tell an edge, and the shutter could not be fitted.
+            0 = the period is as it is.
         on_s: Length of a flash.
         level: Of the flash, 0 (exclusive) .. 1.
         profile: Of the camera.
@@ -64,3 +67,10 @@ class CaptureConfig:
             )
         if not self.kept_rate_hz > 0 or not math.isfinite(self.kept_rate_hz):
             raise ValueError(f"kept_rate_hz is {self.kept_rate_hz}; it must be a positive number")
+
+    def train_period_s(self, fps: float) -> float:
+        """From flash to flash on a camera of so many frames a second: at most a frame period longer."""
+        if self.phase_step == 0:
+            return self.period_s
+        whole = math.ceil(self.period_s * fps - self.phase_step - _ROUNDING)
+        return (whole + self.phase_step) / fps

@@ -115,7 +115,7 @@ class Watch(Protocol):
         """The flash's edges as they are reported, on the frames' axis."""
 
     def say(self, sentence: str) -> None:
-        """A warning, as soon as it is known."""
+        """A warning as soon as it is known, or what takes time now."""
 
 
 class FrameLooker:

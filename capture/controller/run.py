@@ -45,6 +45,7 @@ _USUAL_FPS = 30.0
 # Of a wrong label: ten thousand flashes must pass without one (benchmarks/soak.py).
 _RISK = 1e-4
 _STAMP_SIGMA_S = 1e-4  # of a driver's stamps
+_SURE_PULSES = 3  # reported ones that no light answers
 
 
 @dataclass(frozen=True)
@@ -197,13 +198,16 @@ class _Capture:
         self._tagger.shutdown()
         if self._tagging is not None:
             self._tags.update(self._tagging.result())
+        if self._watch is not None:
+            self._watch.say("The lamp is off; telling lit frames from unlit ones.")
         if (rest := self._looker.finish()) is not None:
             self._tags.update(rest[0])
             result = rest[1]
-            if result.refused is None:
+            refused = result.refused or self._stranger(result)
+            if refused is None:
                 apply_tags(session, self._tags, self._config)
             elif stopped is None and signal is None:
-                stopped = result.refused
+                stopped = refused
             for sentence in result.warnings:
                 if sentence != stopped:
                     self._warn(sentence)
@@ -220,6 +224,17 @@ class _Capture:
         )
         session.finish("complete" if stopped is None and signal is None else "interrupted")
         return stopped
+
+    def _stranger(self, result: StreamResult) -> str | None:
+        """A sentence when what lit the frames is not the flash: no pulse comes when one was reported."""
+        reported = self._counts.edges // 2
+        if reported < _SURE_PULSES or result.matched:
+            return None
+        return (
+            f"The flash reported {reported} flashes and the frames show {result.pulses} changes of light at "
+            "other times; point the lamp at the subject, see that it lights up, and that no other "
+            "light changes."
+        )
 
     def _take_frames(
         self, folder: Path, sink: FrameSink, edges: EdgeLog, interrupts: Interrupts
@@ -265,7 +280,7 @@ class _Capture:
 
     def _start_train(self) -> None:
         config = self._config
-        period_s = config.period_s + config.phase_step / self._fps
+        period_s = config.train_period_s(self._fps)
         count = min(65535, 1 + math.ceil(config.duration_s / period_s))
         self._flash.start(
             PulseTrain(

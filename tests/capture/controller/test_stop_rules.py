@@ -86,3 +86,11 @@ def test_a_disk_that_fills_stops_before_it_is_full(rules, monkeypatch):
 def test_settings_beyond_safety_or_sense_are_refused(wrong):
     with pytest.raises(ValueError, match=next(reversed(wrong))):
         CaptureConfig(**wrong)
+
+
+@pytest.mark.parametrize("fps", [7.5, 15.0, 24.0, 25.0, 29.7, 29.97, 30.0, 50.0, 60.0])
+def test_flashes_begin_ever_elsewhere_in_their_frames(fps):
+    period_s = CaptureConfig().train_period_s(fps)
+    assert 1.0 <= period_s < 1.0 + 1 / fps
+    assert (period_s * fps) % 1 == pytest.approx(0.382, abs=1e-6)
+    assert CaptureConfig(phase_step=0.0).train_period_s(fps) == 1.0
