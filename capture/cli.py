@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from capture.errors import CameraError, DeviceError, RelightError
 from capture.terminal import run_guarded
@@ -194,10 +194,25 @@ def _conclude(outcome: CaptureOutcome) -> None:
     usable = [frame for frame in session.frames if frame.usable]
     lit = sum(frame.flash == 1 for frame in usable)
     print(f"{session.path}: {len(session.frames)} frames, {lit} lit and {len(usable) - lit} unlit ones kept")
+    report = session.info["capture"]
+    if (light := report["light"]) is not None and light["pulses"]:
+        print(", ".join(_told(report, light)))
     if outcome.stopped is not None:
         raise CaptureStoppedError(outcome.stopped)
     if outcome.signal is not None:
         raise KeyboardInterrupt
+
+
+def _told(report: dict[str, Any], light: dict[str, Any]) -> list[str]:
+    """What was measured of frames and flash, for a line."""
+    told = [f"{report['lost']} frames lost", f"{light['pulses']} flashes seen"]
+    if light["latency_s"] is not None:
+        told.append(f"{1e3 * light['latency_s']:+.1f} ms after they were reported")
+        told.append(f"varying by {1e3 * (light['latency_jitter_s'] or 0.0):.1f} ms")
+    if light["droop_share"] is not None:
+        told.append(f"dimmer by {light['droop_share']:.1%} at the end")
+    told.append(f"{light['contradictions']} frames contradict the flash")
+    return told
 
 
 def _first_camera(flash_url: str) -> str:

@@ -6,17 +6,24 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from capture.controller.config import CaptureConfig
 from capture.controller.run import run_capture
 from capture.devices.camera import CameraProfile
 from capture.devices.table import open_bench, open_camera, open_flash
+from capture.doctor.banding import Banding, find_banding
 from capture.doctor.finding import Finding, Level
+from capture.session import Session
 
 _SECONDS = 8.0
 _GOOD_JITTER_S = 0.003
 _FLICKER_DEPTH = 0.01
 _LOST_SHARE = 0.01
 _SIGMAS = 2.0
+_MOST_LIT = 16
+_BANDING_DEPTH = 0.01
 
 
 def rehearse(camera_url: str, flash_url: str, profile: CameraProfile, on_s: float) -> list[Finding]:
@@ -26,7 +33,7 @@ def rehearse(camera_url: str, flash_url: str, profile: CameraProfile, on_s: floa
         DeviceError: A device cannot be opened or locked.
         KeyboardInterrupt: A signal has ended it.
     """
-    config = CaptureConfig(duration_s=_SECONDS, on_s=on_s, profile=profile, restore=True)
+    config = CaptureConfig(duration_s=_SECONDS, on_s=on_s, profile=profile, restore=True, keep_all=True)
     bench = open_bench(camera_url, flash_url, _SECONDS)
     with (
         tempfile.TemporaryDirectory(prefix="relight-doctor-") as folder,
@@ -36,11 +43,13 @@ def rehearse(camera_url: str, flash_url: str, profile: CameraProfile, on_s: floa
         outcome = run_capture(camera, flash, bench, Path(folder) / "rehearsal", config)
         info = outcome.session.info
         fps = camera.format.fps
+        banding = find_banding(*_rows(outcome.session))
     if outcome.signal is not None:
         raise KeyboardInterrupt
     findings = [_of_control(control) for control in info["device"]["controls"]]
     findings += _of_frames(info["capture"])
     findings += _of_light(info["capture"], on_s, fps)
+    findings += _of_banding(banding, info["capture"]["light"])
     said = {finding.sentence for finding in findings}
     if outcome.stopped is not None and outcome.stopped not in said:
         findings.append(Finding("rehearsal", Level.BAD, outcome.stopped))
@@ -48,6 +57,38 @@ def rehearse(camera_url: str, flash_url: str, profile: CameraProfile, on_s: floa
         Finding("rehearsal", Level.NOTE, sentence) for sentence in outcome.warnings if sentence not in said
     ]
     return findings
+
+
+def _rows(session: Session) -> tuple[list[NDArray[np.float32]], list[NDArray[np.float32]]]:
+    """Of lit frames and of an unlit one near each: the mean radiance of every row, [H, 1, 3]."""
+    frames = [record for record in session.frames if record.usable]
+    unlit = [record for record in frames if record.flash == 0]
+    pairs: tuple[list[NDArray[np.float32]], list[NDArray[np.float32]]] = ([], [])
+    if not unlit:
+        return pairs
+    lit = [record for record in frames if record.flash == 1][:_MOST_LIT]
+    for record in lit:
+        near = min(unlit, key=lambda other: abs((other.pts_s or 0.0) - (record.pts_s or 0.0)))
+        for rows, frame in zip(pairs, (record, near), strict=True):
+            rows.append(session.load_radiance(frame).mean(axis=1, keepdims=True))
+    return pairs
+
+
+def _of_banding(banding: Banding | None, light: dict[str, Any] | None) -> list[Finding]:
+    """Whether the lamp is dimmed by switching."""
+    if banding is None or banding.depth < _BANDING_DEPTH:
+        return []
+    readout_s = None if light is None else light["readout_s"]
+    rate = f", about {banding.waves / abs(readout_s):.0f} Hz" if readout_s else ""
+    return [
+        Finding(
+            "banding",
+            Level.NOTE,
+            f"The flash's own light bands: {banding.waves:.0f} stripes over the picture{rate}, "
+            f"{banding.depth:.1%} deep.",
+            "It is dimmed by switching: run it at full level, or keep the camera still if it was not.",
+        )
+    ]
 
 
 def _of_control(control: dict[str, Any]) -> Finding:

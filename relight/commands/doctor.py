@@ -79,7 +79,7 @@ def _look(args: argparse.Namespace) -> list[Finding]:
                 "rehearsal",
                 Level.SKIPPED,
                 "Locks, latency and banding show only in a rehearsal.",
-                "Point the camera at a person or thing half a metre away and give --camera and --flash.",
+                "Point the camera at a thing half a metre away, keep it still; give --camera and --flash.",
             )
         )
         return findings

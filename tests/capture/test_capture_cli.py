@@ -26,6 +26,8 @@ def test_a_capture_says_what_it_kept(typed, tmp_path):
     code, out, _ = typed("--flash", "sim:", "--camera", "sim:coarse", "--duration", "4", "--quiet")
     assert code == 0
     assert re.search(r"S: 12[01] frames, \d+ lit and \d+ unlit ones kept", out)
+    assert re.search(r"0 frames lost, [34] flashes seen, [+-]\d\.\d ms after they were reported", out)
+    assert "0 frames contradict the flash" in out
     session = Session.open(tmp_path / "S")
     assert session.status == "complete"
     assert session.info["flash_schedule"]["on_s"] == 0.1
