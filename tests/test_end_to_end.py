@@ -140,21 +140,3 @@ def test_the_simulated_rig_is_a_device_to_record_from(tmp_path, capsys):
     assert set(session.load_scene_cameras()) == {frame.index for frame in session.frames if frame.file}
     assert len(read_ply(session.points_path).points) > 1000
     assert main(["plan", str(path)]) == 0
-
-
-@pytest.mark.parametrize(
-    ("argv", "sentence"),
-    [
-        (["--camera", "/dev/video0"], "real cameras and flashes come with a later release"),
-        (["--flash", "litra:"], "relight import VIDEO"),
-        (["--camera", "sim:fast"], "known are seed=NUMBER and coarse"),
-        (["--flash", "sim:bright"], "without settings"),
-    ],
-)
-def test_a_device_that_is_not_there_is_one_sentence(tmp_path, capsys, argv, sentence):
-    from capture.cli import main as capture
-
-    assert capture([*argv, "--out", str(tmp_path / "S")]) == 1
-    said = capsys.readouterr().err
-    assert sentence in said
-    assert not (tmp_path / "S").exists()

@@ -83,6 +83,8 @@ def test_a_command_that_cannot_be_is_refused_with_code_two(typed, arguments, say
         ("sim:", "", "names no camera"),
         ("/dev/ttyNONE", "sim:coarse", "/dev/ttyNONE"),
         ("sim:", "/dev/video99", "/dev/video99"),
+        ("sim:", "sim:fast", "known are seed="),
+        ("sim:bright", "sim:coarse", "known are missed="),
         ("sim:unplug_s=3", "sim:coarse", "unplugged"),
     ],
 )

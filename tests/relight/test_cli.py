@@ -58,7 +58,7 @@ def test_help_lists_every_command_and_no_other(capsys):
     said = capsys.readouterr().out
     for name in _COMMANDS:
         assert f"\n    {name} " in said
-    for to_come in ("view", "export", "doctor", "batch"):
+    for to_come in ("view", "export", "batch"):
         assert f"\n    {to_come} " not in said
 
 

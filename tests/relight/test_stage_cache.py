@@ -1,6 +1,7 @@
 """What is done again, and what is not."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -60,7 +61,7 @@ def test_another_setting_flag_or_picture_is_another_key(session):
     cache = StageCache(session)
     before = key(cache, session)
     assert key(cache, session, {"a": 2}) != before
-    session.replace_frames([FrameRecord(**{**record.__dict__, "flash": 1}) for record in session.frames])
+    session.replace_frames([replace(record, flash=1) for record in session.frames])
     assert key(StageCache(session), session) != before
 
 
