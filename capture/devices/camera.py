@@ -15,7 +15,6 @@ from dataclasses import asdict, dataclass
 from types import TracebackType
 from typing import Any, Protocol, Self, runtime_checkable
 
-import numpy as np
 from numpy.typing import NDArray
 
 from capture.cameras import Camera
@@ -246,13 +245,3 @@ class KnowsScene(Protocol):
 
     def known_scene(self) -> KnownScene | None:
         """What it tells; None = it keeps it to itself."""
-
-
-def mean_linear(rgb: NDArray[np.uint8], transfer: str) -> float:
-    """Mean linear light of a picture's unclipped pixels; 0.0 when all are clipped."""
-    from capture.transfer import to_linear
-
-    small = rgb[:: max(1, rgb.shape[0] // 240), :: max(1, rgb.shape[1] // 240)]
-    sound = small.max(axis=-1) < np.iinfo(rgb.dtype).max * 0.98
-    linear = to_linear(small[sound].astype(np.float32) / np.float32(np.iinfo(rgb.dtype).max), transfer)
-    return float(np.mean(linear, dtype=np.float64)) if linear.size else 0.0

@@ -16,7 +16,8 @@ from usb_bus import plugged
 from uvc_camera import UvcCamera, video_node
 from v4l2_controls import another_program
 
-from capture.devices.camera import CameraProfile, mean_linear
+from capture.devices.camera import CameraProfile
+from capture.devices.light_check import linear_luma
 from capture.devices.pixel_formats import decode_rgb
 from capture.devices.table import open_camera
 from capture.errors import CameraError, CameraGoneError
@@ -55,6 +56,10 @@ def frames(camera, count):
 
 def picture(camera):
     return decode_rgb(camera.read(PATIENCE_S).data, camera.format)
+
+
+def light(camera):
+    return linear_luma(camera.read(PATIENCE_S), camera.format).mean()
 
 
 def test_opening_changes_nothing(desk):
@@ -105,10 +110,10 @@ def test_what_another_program_sets_is_noticed(desk):
 def test_half_the_exposure_time_is_half_the_light(desk):
     desk.camera.lock(PROFILE)
     frames(desk.camera, IN_FLIGHT)
-    long = mean_linear(picture(desk.camera), desk.camera.format.transfer)
+    long = light(desk.camera)
     desk.camera.lock(replace(PROFILE, exposure_s=0.0025))
     frames(desk.camera, IN_FLIGHT)
-    short = mean_linear(picture(desk.camera), desk.camera.format.transfer)
+    short = light(desk.camera)
     # 8 bits of the darkest grey (0.05 / 4 of white): half a code is 3 % of its light.
     assert long / short == pytest.approx(2.0, rel=0.04)
 

@@ -6,7 +6,8 @@ import os
 import pytest
 
 from capture.devices.bench import Bench, VirtualClock
-from capture.devices.camera import CameraProfile, mean_linear
+from capture.devices.camera import CameraProfile
+from capture.devices.light_check import linear_luma
 from capture.devices.pixel_formats import decode_rgb
 from capture.devices.v4l2 import structs as v4l2
 from capture.devices.v4l2.camera import V4l2Camera
@@ -40,7 +41,7 @@ def control(report, name):
 
 
 def brightness(camera, frames=8):
-    values = [mean_linear(decode_rgb(camera.read(1.0).data, camera.format), "srgb") for _ in range(frames)]
+    values = [float(linear_luma(camera.read(1.0), camera.format).mean()) for _ in range(frames)]
     return sum(values) / len(values)
 
 
