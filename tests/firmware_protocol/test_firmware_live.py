@@ -97,11 +97,23 @@ def test_a_host_shakes_hands_and_lights_the_lamp_once(live):
     assert (off.tick - on.tick) / tick_hz == pytest.approx(0.05, abs=8e-6)
 
 
+def told_until_now(edges_file, patience_s=5.0):
+    """The file's lines up to a time after the last edge; a machine that is held up writes that one late."""
+    give_up_s = time.monotonic() + patience_s
+    while True:
+        lines = [
+            line.split() for line in edges_file.read_text().splitlines(keepends=True) if line.endswith("\n")
+        ]
+        if lines[-1][1] == "t" or time.monotonic() > give_up_s:
+            return lines
+        time.sleep(0.005)
+
+
 def test_the_edges_file_has_the_lamp_by_the_clock_of_the_system(live, edges_file):
     before_ns = time.clock_gettime_ns(time.CLOCK_MONOTONIC)
     on, off, tick_hz = light_once(live)
     after_ns = time.clock_gettime_ns(time.CLOCK_MONOTONIC)
-    lines = [line.split() for line in edges_file.read_text().splitlines()]
+    lines = told_until_now(edges_file)
     times_ns = [int(when) for when, _ in lines]
     assert times_ns == sorted(times_ns)
     (on_ns, off_ns) = (int(when) for when, what in lines if what != "t")
@@ -109,4 +121,4 @@ def test_the_edges_file_has_the_lamp_by_the_clock_of_the_system(live, edges_file
     # The file's edges and the firmware's own ticks are the same two moments, but for their roundings.
     assert (off_ns - on_ns) * 1e-9 == pytest.approx((off.tick - on.tick) / tick_hz, abs=8e-6)
     assert sum(what == "t" for _, what in lines) > 2  # hundreds, but on a machine that is held up
-    assert lines[-1][1] == "t"
+    assert lines[-1][1] == "t"  # its time goes on after the last edge
