@@ -6,10 +6,10 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from relight.commands.calibrate.flags import add_out, add_transfer, chosen_response
+
 if TYPE_CHECKING:
-    from calib.calibration import Calibration
     from calib.noise import DarkResult, NoiseResult
-    from capture.response import Response
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -29,18 +29,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="PAIRS",
         help="two or more pictures at each of several exposures, nothing moving: flats, or a kept sweep",
     )
-    parser.add_argument(
-        "--transfer",
-        metavar="CURVE",
-        help="curve of the pictures where calibration.json has no response (default srgb)",
-    )
-    parser.add_argument(
-        "--out",
-        required=True,
-        type=Path,
-        metavar="FILE",
-        help="calibration.json to write into, or the session whose it is",
-    )
+    add_transfer(parser)
+    add_out(parser)
 
 
 def run(args: argparse.Namespace) -> None:
@@ -84,17 +74,6 @@ def run(args: argparse.Namespace) -> None:
             "note        The response was found before the dark level was known; run `relight calibrate "
             "response` again, which takes it off."
         )
-
-
-def chosen_response(known: Calibration, transfer: str | None) -> tuple[Response, str]:
-    """The response to linearise with, and what it is."""
-    from capture.response import Response
-    from capture.transfer import canonical_transfer
-
-    if known.response is not None and transfer is None:
-        return known.response, "the response of calibration.json"
-    name = canonical_transfer(transfer or "srgb")
-    return Response(name), f"{name} ({'as named' if transfer else 'no response is known'})"
 
 
 def _describe_dark(dark: DarkResult) -> str:

@@ -6,6 +6,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from relight.commands.calibrate.flags import add_out, add_transfer, chosen_response
+
 if TYPE_CHECKING:
     from calib.flat_field import FlatFieldResult
 
@@ -20,18 +22,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="pictures that a plain, evenly lit surface fills: three or more, each of another place of it or "
         "with the camera turned; a folder, single pictures or a session",
     )
-    parser.add_argument(
-        "--transfer",
-        metavar="CURVE",
-        help="curve of the pictures where calibration.json has no response (default srgb)",
-    )
-    parser.add_argument(
-        "--out",
-        required=True,
-        type=Path,
-        metavar="FILE",
-        help="calibration.json to write into, or the session whose it is",
-    )
+    add_transfer(parser)
+    add_out(parser)
 
 
 def run(args: argparse.Namespace) -> None:
@@ -39,7 +31,6 @@ def run(args: argparse.Namespace) -> None:
     from calib.calibration import Calibration, Quantity, load_calibration, save_calibration
     from calib.flat_field import fit_flat_field
     from calib.stills import read_stills
-    from relight.commands.calibrate.dark import chosen_response
 
     out = args.out / "calibration.json" if args.out.is_dir() else args.out
     known = load_calibration(out)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from relight.commands.arguments import positive_integer, positive_number
 from relight.commands.calibrate.board import add_board_flags, board_of
+from relight.commands.calibrate.flags import add_out
 
 if TYPE_CHECKING:
     from calib.intrinsics import IntrinsicsResult
@@ -26,13 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--board", type=Path, metavar="FILE", help="the .json of the printed board, or:")
     add_board_flags(parser)
-    parser.add_argument(
-        "--out",
-        required=True,
-        type=Path,
-        metavar="FILE",
-        help="calibration.json to write into, or the session whose it is",
-    )
+    add_out(parser)
     parser.add_argument("--report", type=Path, metavar="FILE", help="an .html page to judge it by")
     parser.add_argument(
         "--model",

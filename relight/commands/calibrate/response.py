@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from relight.commands.arguments import positive_integer, positive_number
+from relight.commands.calibrate.flags import add_out
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -36,13 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="no sweep: srgb, rec709, gamma:G, log:A, or a profile of Open Camera (fine, low, medium, "
         "strong, extra_strong, jtvideo, jtlog, jtlog2)",
     )
-    parser.add_argument(
-        "--out",
-        required=True,
-        type=Path,
-        metavar="FILE",
-        help="calibration.json to write into, or the session whose it is",
-    )
+    add_out(parser)
     live = parser.add_argument_group("with --camera")
     live.add_argument("--size", type=_size, metavar="WxH", help="of the pictures (default: the camera's)")
     live.add_argument("--gain", type=positive_number, metavar="N", help="as in the captures")
