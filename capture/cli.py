@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import logging
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from datetime import datetime
 from pathlib import Path
@@ -117,7 +117,7 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _prepared(args: argparse.Namespace):  # type: ignore[no-untyped-def]
+def _prepared(args: argparse.Namespace) -> Callable[[], None]:
     """The work, with the settings checked."""
     parser = _parser()
     if args.flash is None:

@@ -19,6 +19,7 @@ from types import TracebackType
 from typing import Any, Self
 
 import cv2
+import numpy as np
 
 from capture.devices.bench import Bench
 from capture.devices.camera import (
@@ -170,7 +171,7 @@ class OpenCvCamera:
         elif self._reader.stamped and not all(late > early for early, late in pairwise(stamps)):
             self._reader.stamped = False
             self._reader.restart()
-        height, width = frame.data.shape[:2]  # type: ignore[union-attr]
+        height, width = np.shape(frame.data)[:2]
         self._format = StreamFormat(
             width=width, height=height, pixel_format="RGB3", fps=float(fps) if fps > 0 else None
         )

@@ -36,9 +36,11 @@ class ClosedTerminal(Terminal):
     """A window that is closed while it is drawn into; a pipe whose reader has ended."""
 
     closed_now = False
+    refused = 0
 
     def write(self, text):
         if self.closed_now:
+            self.refused += 1
             raise OSError(5, "Input/output error")
         return super().write(text)
 
@@ -138,3 +140,4 @@ def test_a_closed_terminal_does_not_end_the_capture(on_terminal, monkeypatch):
         for _ in range(3):
             clock.sleep(5.0)
             shown.show(STATE)
+    assert stream.refused >= 1

@@ -132,7 +132,7 @@ class TestModel:
         flash.start(PulseTrain(start_s=clock.now_s() + 2))
         run_until(flash, clock, clock.now_s() + 1.95)
         transport.get_feature = None  # to read it would fail
-        flash.poll()
+        assert flash.poll() == ()
 
     def test_no_level_but_full(self, flash, clock):
         with pytest.raises(FlashError, match="cannot be dimmed"):
