@@ -3,7 +3,7 @@
     python -m benchmarks.flash_geometry --out benchmarks/results/flash_geometry.json
 
 Each set has a board of 0.15 x 0.21 m at 0.25 to 0.6 m; squares with 0.3 % noise and 0.3 % texture, pulses
-that differ by 1 %, corners found to 0.1 px. The sets are those of `tests/calib/test_flash_fit.py`.
+that differ by 1 %, corners found to 0.1 px. The sets are those of `tests/calib/flash/test_flash_fit.py`.
 """
 
 from __future__ import annotations
@@ -49,7 +49,8 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--sets", type=int, default=400)
     args = parser.parse_args()
-    spec = importlib.util.spec_from_file_location("sets", ROOT / "tests" / "calib" / "test_flash_fit.py")
+    path = ROOT / "tests" / "calib" / "flash" / "test_flash_fit.py"
+    spec = importlib.util.spec_from_file_location("sets", path)
     assert spec is not None
     assert spec.loader is not None
     sets = importlib.util.module_from_spec(spec)

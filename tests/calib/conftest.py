@@ -4,11 +4,11 @@ import cv2
 import numpy as np
 import pytest
 
-from calib.board import Board
-from calib.board_detection import BoardView
-from calib.bundle import Solution, minimise, observations_of
-from calib.lens_uncertainty import uncertainty_of
-from calib.projection import project
+from calib.board.charuco import Board
+from calib.board.detection import BoardView
+from calib.lens.bundle import Solution, minimise, observations_of
+from calib.lens.projection import project
+from calib.lens.uncertainty import uncertainty_of
 
 SIZE = (480, 360)
 LENS = np.array([420.0, 421.5, 242.3, 177.1, -0.22, 0.08, 0.001, -0.0015, 0.0])

@@ -7,9 +7,9 @@ import cv2
 import numpy as np
 import pytest
 
-from calib.board import load_board, save_board
+from calib.board.charuco import load_board, save_board
 from calib.calibration import load_calibration
-from calib.intrinsics_save import evidence_path
+from calib.lens.save import evidence_path
 from capture.images import write_png
 from capture.video import VideoWriter
 from relight.cli import main

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from relight.commands.arguments import positive_number
 
 if TYPE_CHECKING:
-    from calib.board import Board
+    from calib.board.charuco import Board
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -51,7 +51,7 @@ def add_board_flags(parser: argparse.ArgumentParser) -> None:
 
 def board_of(args: argparse.Namespace) -> Board:
     """The board of the flags, with the usual values where they are silent."""
-    from calib.board import Board
+    from calib.board.charuco import Board
 
     usual = Board()
     square_m = args.square_mm / 1e3 if args.square_mm else usual.square_m
@@ -67,8 +67,8 @@ def board_of(args: argparse.Namespace) -> Board:
 
 def run(args: argparse.Namespace) -> None:
     """Writes the sheet and its description."""
-    from calib.board import save_board
-    from calib.board_print import write_sheet
+    from calib.board.charuco import save_board
+    from calib.board.printing import write_sheet
 
     board = board_of(args)
     write_sheet(board, args.out, args.paper, args.dpi)

@@ -26,7 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Reads one file, writes the other."""
-    from calib.lens_files import read_lens, write_lens
+    from calib.lens.files import read_lens, write_lens
 
     intrinsics = read_lens(args.source, args.camera)
     write_lens(intrinsics, args.out, args.to)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from relight.commands.calibrate.flags import add_out, add_transfer, chosen_response
 
 if TYPE_CHECKING:
-    from calib.noise import DarkResult, NoiseResult
+    from calib.sensor.noise import DarkResult, NoiseResult
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -37,7 +37,7 @@ def run(args: argparse.Namespace) -> None:
     """Finds dark level and noise and saves them."""
     from calib.calibration import Calibration, Quantity, load_calibration, save_calibration
     from calib.errors import NoiseError
-    from calib.noise import fit_dark, fit_noise
+    from calib.sensor.noise import fit_dark, fit_noise
     from calib.stills import read_stills
 
     if not args.source and not args.flats:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from relight.commands.arguments import positive_number
 
 if TYPE_CHECKING:
-    from calib.flash_geometry import FlashGeometry
+    from calib.flash.geometry import FlashGeometry
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -53,13 +53,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Reads the pairs, finds the flash, saves and reports."""
-    from calib.board import load_board
+    from calib.board.charuco import load_board
     from calib.calibration import load_calibration
     from calib.errors import FlashGeometryError
-    from calib.flash_geometry import calibrate_flash
-    from calib.flash_pairs import open_pairs
-    from calib.flash_samples import collect_boards, lens_vector
-    from calib.flash_save import flash_evidence_path, save_flash
+    from calib.flash.geometry import calibrate_flash
+    from calib.flash.pairs import open_pairs
+    from calib.flash.samples import collect_boards, lens_vector
+    from calib.flash.save import flash_evidence_path, save_flash
     from capture.terminal import StageProgress
 
     board = load_board(args.board)
@@ -90,9 +90,9 @@ def _describe(found: FlashGeometry) -> str:
     """What was found, in a few lines for a person."""
     import numpy as np
 
-    from calib.flash_checks import axis_sigma, falloff_sigma
-    from calib.flash_geometry import poses_of
-    from calib.flash_model import FALLOFF
+    from calib.flash.checks import axis_sigma, falloff_sigma
+    from calib.flash.geometry import poses_of
+    from calib.flash.model import FALLOFF
 
     light, check = found.fit.light, found.held_out
     place = ", ".join(

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from relight.commands.calibrate.flags import add_out, add_transfer, chosen_response
 
 if TYPE_CHECKING:
-    from calib.flat_field import FlatFieldResult
+    from calib.sensor.flat_field import FlatFieldResult
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -29,7 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> None:
     """Finds the flat field and saves it."""
     from calib.calibration import Calibration, Quantity, load_calibration, save_calibration
-    from calib.flat_field import fit_flat_field
+    from calib.sensor.flat_field import fit_flat_field
     from calib.stills import read_stills
 
     out = args.out / "calibration.json" if args.out.is_dir() else args.out

@@ -11,12 +11,12 @@ from relight.commands.calibrate.board import add_board_flags, board_of
 from relight.commands.calibrate.flags import add_out
 
 if TYPE_CHECKING:
-    from calib.intrinsics import IntrinsicsResult
+    from calib.lens.intrinsics import IntrinsicsResult
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The flags."""
-    from calib.lens_terms import LENS_MODELS
+    from calib.lens.terms import LENS_MODELS
 
     parser.add_argument(
         "source",
@@ -53,13 +53,13 @@ def run(args: argparse.Namespace) -> None:
     """Finds the views, calibrates, saves and reports."""
     import numpy as np
 
-    from calib.board import load_board
-    from calib.board_pictures import board_pictures
-    from calib.board_views import collect_views
+    from calib.board.charuco import load_board
+    from calib.board.pictures import board_pictures
     from calib.errors import BoardError
-    from calib.intrinsics import calibrate_intrinsics
-    from calib.intrinsics_report import write_intrinsics_report
-    from calib.intrinsics_save import evidence_path, save_intrinsics
+    from calib.lens.intrinsics import calibrate_intrinsics
+    from calib.lens.report import write_intrinsics_report
+    from calib.lens.save import evidence_path, save_intrinsics
+    from calib.lens.views import collect_views
     from capture.terminal import StageProgress
 
     flags = (args.squares, args.square_mm, args.marker_mm, args.dictionary, args.legacy)
@@ -85,8 +85,8 @@ def _describe(result: IntrinsicsResult, distance_m: float) -> str:
     """What was found, in a few lines for a person."""
     import numpy as np
 
-    from calib.lens_terms import LENS_MODELS, LENS_NAMES
-    from calib.lens_uncertainty import pixel_grid, projection_sigma
+    from calib.lens.terms import LENS_MODELS, LENS_NAMES
+    from calib.lens.uncertainty import pixel_grid, projection_sigma
 
     numbers = dict(zip(LENS_NAMES, zip(result.lens, result.sigma, strict=True), strict=True))
     pinhole = ", ".join(f"{name} {numbers[name][0]:.2f} ± {numbers[name][1]:.2f}" for name in LENS_NAMES[:4])

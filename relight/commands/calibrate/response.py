@@ -12,9 +12,9 @@ from relight.commands.calibrate.flags import add_out
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from calib.response_check import OtherResponse
-    from calib.response_fit import ResponseResult
-    from calib.response_groups import SweepFrame
+    from calib.response.check import OtherResponse
+    from calib.response.fit import ResponseResult
+    from calib.response.groups import SweepFrame
 
 
 _STILL_S = 1e6  # the hand of a simulated camera takes so long around the head that it stands still
@@ -97,7 +97,7 @@ def _save_named(name: str, out: Path) -> None:
 
 def _read(sources: Sequence[Path]) -> list[SweepFrame]:
     from calib.errors import ResponseError
-    from calib.response_groups import SweepFrame
+    from calib.response.groups import SweepFrame
     from calib.stills import EXPOSURE_LIST, read_stills
 
     frames = []
@@ -133,10 +133,10 @@ def _driven(args: argparse.Namespace) -> list[SweepFrame]:
 
 def _find(frames: list[SweepFrame], source: str, out: Path) -> None:
     from calib.calibration import load_calibration
-    from calib.response_check import compare_opencv, nearest_curve
-    from calib.response_fit import fit_response
-    from calib.response_groups import gather_groups
-    from calib.response_save import response_evidence_path, save_response
+    from calib.response.check import compare_opencv, nearest_curve
+    from calib.response.fit import fit_response
+    from calib.response.groups import gather_groups
+    from calib.response.save import response_evidence_path, save_response
 
     result = fit_response(gather_groups(frames), load_calibration(out).value("dark"))
     others = (nearest_curve(result), *compare_opencv(frames, result))

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from calib.errors import ResponseError
-from calib.response_groups import SweepFrame
+from calib.response.groups import SweepFrame
 from calib.stills import EXPOSURE_LIST
 from capture.atomic import atomic_write
 from capture.devices.camera import CameraDevice, CameraProfile, CapturedFrame

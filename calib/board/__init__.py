@@ -1,0 +1,1 @@
+"""ChArUco boards: what they are, on paper, and found in pictures."""

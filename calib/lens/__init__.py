@@ -1,0 +1,1 @@
+"""A camera's geometry from pictures of a board, and how far to trust it."""

@@ -1,0 +1,1 @@
+"""From stored values to linear radiance, found in an exposure sweep."""

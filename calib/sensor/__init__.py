@@ -1,0 +1,1 @@
+"""Dark level, noise, and what the lens passes to the corners."""
