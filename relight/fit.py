@@ -1,7 +1,8 @@
-"""From a session to a portrait: plan, geometry, solve, pictures, report; each step in a module of its own.
+"""From a session to a portrait: plan, geometry, solve, refinement, report; each step in a module of its own.
 
 portraits/NAME/portrait.safetensors, portrait.json   the portrait
-               config.json                           the resolved configuration of the solve
+               config.json                           the resolved configuration of solve and refinement
+               checkpoint/                           where a refinement goes on when it is run again
                plan.json                             what ran, what was skipped, and why
                metrics.json                          seconds a stage, peak memory, versions
                previews/                             pictures
@@ -13,6 +14,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+import time
 from collections.abc import Mapping
 from dataclasses import asdict
 from datetime import UTC, datetime
@@ -30,12 +32,13 @@ from capture.transfer import to_display
 from relight.derive import derive_scene
 from relight.devices import choose_device, describe_device
 from relight.errors import GeometryError, PlanError
-from relight.face import FaceConfig, find_face, save_face
+from relight.face import FaceConfig, FacePrior, find_face, save_face
 from relight.geometry_plan import GEOMETRY_STAGES, GeometryConfig, candidates
 from relight.photometric import SolveConfig, solve
 from relight.plan import Action, Decision, Plan
 from relight.planning import make_plan
 from relight.portrait import Portrait
+from relight.presets import chosen_preset
 from relight.previews import write_previews
 from relight.report import write_report
 from relight.scene import load_scene
@@ -44,13 +47,13 @@ from relight.stage_cache import StageCache
 from relight.stages import Progress, Stages, memory_summary, no_progress
 from relight.version import installed_version
 
-PRESETS = ("solve",)
 REFUSED_DB, REFUSED_COVER = 21.0, 0.7
 """A portrait under these shows something else than its frames (right ones have 30 dB and more, and 0.95)."""
 
 DOUBTED_DB, DOUBTED_COVER = 25.0, 0.85
 
-PRESETS_TO_COME = ("fast", "balanced", "paper")
+_AFTERWARDS = 6.0  # what follows a refinement takes this many times as long as the check of the solve
+_KEY_FILE = "key.json"  # of a checkpoint
 
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,79}")
 
@@ -64,6 +67,8 @@ def fit(
     name: str | None = None,
     forced: Mapping[str, Action] | None = None,
     geometry: GeometryConfig | None = None,
+    settings: Mapping[str, Any] | None = None,
+    seed: int = 0,
     fresh: bool = False,
     progress: Progress = no_progress,
 ) -> Path:
@@ -71,12 +76,15 @@ def fit(
 
     Args:
         session: The session's folder.
-        preset: One of `PRESETS`.
+        preset: One of `relight.presets.PRESETS`.
         device: "cpu" or "cuda"; by default the card where there is one.
-        max_seconds: Time that the fit should end within; the plan leaves frames out until it does.
+        max_seconds: Time that the fit should end within; the plan leaves frames out until the solve does, and
+            a refinement gives the best it has when what is left is spent.
         name: What to call the portrait; its preset's name by default. One of that name is replaced.
         forced: Decisions of the plan to turn round.
         geometry: How poses, cloud and masks are found where the session does not bring them.
+        settings: Of the preset's refinement, those that shall not be as usual.
+        seed: Of all that a refinement draws by chance.
         fresh: Whether to do again what an earlier run left, though nothing that it depends on has changed.
         progress: Told (stage, fraction).
 
@@ -87,7 +95,9 @@ def fit(
         GeometryError: Poses, cloud or masks cannot be found in the frames.
         PlanError: The session cannot be fitted, or an argument is not one of those known.
     """
-    _check_preset(preset)
+    started_s = time.perf_counter()
+    chosen = chosen_preset(preset)
+    refine, refinement = chosen.load_refine(), chosen.config(settings or {})
     geometry = geometry or GeometryConfig()
     torch_device = choose_device(device)
     name = preset if name is None else name
@@ -108,7 +118,11 @@ def fit(
     config = SolveConfig(mirror=plan.runs("face_prior"))
     folder = opened.portraits_dir / name
     cache = StageCache(opened)
-    key = _solve_key(opened, cache, plan, config, geometry.face, torch_device)
+    solve_key = _solve_key(opened, cache, plan, config, geometry.face, torch_device)
+    key = solve_key
+    if refine is not None:
+        limit = {"preset": preset, "config": asdict(refinement), "seed": seed, "max_seconds": max_seconds}
+        key = f"{solve_key} {json.dumps(limit, sort_keys=True, default=str)}"
     if not fresh and _is_current(folder, key):
         return folder
     with stages.follow(progress) as told:
@@ -124,9 +138,25 @@ def fit(
     with stages.stage("check"):
         check = check_portrait(portrait, scene)
         warnings = _judged(check, found=cache.record("poses") is not None)
+    face = None
     if plan.runs("face_prior"):
         with stages.stage("face"):
-            plan = plan.with_decision(_find_face(opened, portrait, geometry.face, progress))
+            face, decision = _find_face(opened, portrait, geometry.face, progress)
+            plan = plan.with_decision(decision)
+    if refine is not None:
+        with stages.follow(progress) as told:
+            portrait = refine(
+                scene,
+                portrait,
+                config=refinement,
+                seconds=_seconds_left(max_seconds, started_s, stages),
+                face=None if face is None else face.to(torch_device),
+                checkpoint=_checkpoint(folder, f"{solve_key} {preset} {seed}", fresh),
+                seed=seed,
+                progress=told,
+            )
+        with stages.stage("check"):
+            check = check_portrait(portrait, scene)
 
     folder.mkdir(parents=True, exist_ok=True)
     for outdated in ("evaluation.json", "config.json"):  # they belong to the portrait that is replaced now
@@ -140,11 +170,18 @@ def fit(
     metrics |= {
         "check": asdict(check),
         "geometry": cache.reports(),
-        "warnings": [*cache.warnings(), *warnings],
+        "warnings": [*cache.warnings(), *warnings, *portrait.info.get("warnings", ())],
     }
     _write_json(folder / "metrics.json", metrics)
     # Last, because its key says that all of the portrait is there.
     resolved = {"key": key, "preset": preset, "solve": asdict(config), "geometry": asdict(geometry)}
+    if refine is not None:
+        resolved = {
+            **resolved,
+            "refinement": asdict(refinement),
+            "seed": seed,
+            "max_seconds": max_seconds,
+        }
     _write_json(folder / "config.json", resolved)
     write_report(session, name)
     return folder
@@ -172,7 +209,29 @@ def _judged(check: SelfCheck, *, found: bool) -> list[str]:
     return []
 
 
-def _find_face(session: Session, portrait: Portrait, config: FaceConfig, progress: Progress) -> Decision:
+def _seconds_left(max_seconds: float | None, started_s: float, stages: Stages) -> float | None:
+    """What a refinement may take, so that pictures and report are there in time too; None = all it wants."""
+    if max_seconds is None:
+        return None
+    reserved_s = _AFTERWARDS * stages.seconds["check"]
+    return max(0.0, max_seconds - (time.perf_counter() - started_s) - reserved_s)
+
+
+def _checkpoint(folder: Path, key: str, fresh: bool) -> Path:
+    """The folder in which a refinement keeps its state: emptied if what lies there is of another solve."""
+    checkpoint = folder / "checkpoint"
+    written = json.dumps({"key": key}).encode()
+    own = checkpoint / _KEY_FILE
+    if fresh or not own.is_file() or own.read_bytes() != written:
+        shutil.rmtree(checkpoint, ignore_errors=True)
+        checkpoint.mkdir(parents=True)
+        atomic_write(own, written)
+    return checkpoint
+
+
+def _find_face(
+    session: Session, portrait: Portrait, config: FaceConfig, progress: Progress
+) -> tuple[FacePrior | None, Decision]:
     """Finds the face of a solved portrait and keeps it in the session's scene folder."""
     progress("face", 0.0)
     cameras = session.load_scene_cameras()
@@ -201,9 +260,9 @@ def _find_face(session: Session, portrait: Portrait, config: FaceConfig, progres
     folder = session.scene_dir / "face"
     if result.prior is None:
         shutil.rmtree(folder, ignore_errors=True)
-        return Decision("face_prior", Action.SKIP, result.decision.reason)
+        return None, Decision("face_prior", Action.SKIP, result.decision.reason)
     save_face(result.prior, folder)
-    return Decision("face_prior", Action.RUN, result.decision.reason)
+    return result.prior, Decision("face_prior", Action.RUN, result.decision.reason)
 
 
 def _solve_key(
@@ -238,17 +297,6 @@ def _is_current(folder: Path, key: str) -> bool:
         return bool(parse_json((folder / "config.json").read_bytes()).get("key") == key)
     except (OSError, ValueError, AttributeError):
         return False
-
-
-def _check_preset(preset: str) -> None:
-    if preset in PRESETS_TO_COME:
-        raise PlanError(
-            f"The preset {preset!r} is a neural refinement, which is still to come; use --preset solve, "
-            "the photometric solve that it will start from."
-        )
-    if preset not in PRESETS:
-        known = ", ".join((*PRESETS, *PRESETS_TO_COME))
-        raise PlanError(f"There is no preset {preset!r}; known are {known}, and solve is there today.")
 
 
 def _metrics(plan: Plan, portrait: Portrait, stages: Stages, device: torch.device) -> dict[str, Any]:

@@ -1,4 +1,5 @@
-"""Maps of a portrait from any view: its points splatted, holes filled, and a soft mask.
+"""Maps of a portrait from any view: as its decoder makes them, else its points splatted, holes filled, and a
+soft mask.
 
 Visible points are spread over 3x3 pixels with a Gaussian as wide as half their spacing on the screen, and
 the sums divided by the weights (Zwicker et al. 2001, "Surface splatting", with screen-aligned splats). What
@@ -66,7 +67,22 @@ class Maps:
 
 
 def render_maps(portrait: Portrait, camera: Camera) -> Maps:
-    """Maps of a portrait from a camera.
+    """Maps of a portrait from a camera: by its decoder where it has one, else splatted.
+
+    Args:
+        portrait: At least one point.
+        camera: Lens distortion is not drawn: the maps are those of the pinhole.
+
+    Returns:
+        Maps of the camera's size, all zero where no point is seen.
+    """
+    if portrait.decoder is not None:
+        return portrait.decoder.decode(portrait, camera)
+    return splat_maps(portrait, camera)
+
+
+def splat_maps(portrait: Portrait, camera: Camera) -> Maps:
+    """Maps of a portrait from a camera by its points' values alone.
 
     Args:
         portrait: At least one point.

@@ -1,7 +1,7 @@
 """A fitted portrait: points of the surface with what is known of each, and the lights it was captured in.
 
-    portrait.safetensors     tensors, one row a point
-    portrait.json            version, colours, reflectance, spacing, and where it came from
+    portrait.safetensors     tensors, one row a point; those of its decoder, if it has one, under `decoder.`
+    portrait.json            version, colours, reflectance, spacing, decoder, and where it came from
 
 Nothing that is loaded can run code.
 """
@@ -23,13 +23,18 @@ from safetensors.torch import load_file, save
 from capture.atomic import atomic_write
 from capture.json_fields import parse_json
 from relight.alignment import Similarity
+from relight.decoder import Decoder, restored_decoder
 from relight.errors import PortraitError
 from relight.reflectance import Reflectance
 
-VERSION = 1
+VERSION = 2
+"""1 had no decoder; it is still read."""
 
 TENSORS_FILE = "portrait.safetensors"
 FIELDS_FILE = "portrait.json"
+
+_READ = (1, VERSION)
+_DECODER = "decoder."  # before the names of its tensors
 
 _TENSORS = {
     "points": 3,
@@ -68,6 +73,7 @@ class Portrait:
         flash_offset_cam_m: [3] lens to flash in camera axes.
         reflectance: Of the whole subject.
         info: Free-form facts: software, source, settings, warnings.
+        decoder: What makes the maps of a view; None = the points are splatted.
     """
 
     points: torch.Tensor
@@ -86,17 +92,24 @@ class Portrait:
     flash_offset_cam_m: tuple[float, float, float]
     reflectance: Reflectance
     info: Mapping[str, Any]
+    decoder: Decoder | None = None
 
     def to(self, device: torch.device | str) -> Portrait:
         """The portrait with its tensors on a device."""
-        return replace(self, **{name: getattr(self, name).to(device) for name in _TENSORS})
+        decoder = None if self.decoder is None else self.decoder.to(device)
+        return replace(self, decoder=decoder, **{name: getattr(self, name).to(device) for name in _TENSORS})
 
     def subset(self, keep: torch.Tensor) -> Portrait:
         """Some of the points: [P] bool, or their indices."""
-        return replace(self, **{name: getattr(self, name)[keep] for name in _TENSORS})
+        decoder = None if self.decoder is None else self.decoder.subset(keep)
+        return replace(self, decoder=decoder, **{name: getattr(self, name)[keep] for name in _TENSORS})
 
     def transformed(self, similarity: Similarity) -> Portrait:
-        """The portrait in another world; it looks the same to cameras that are taken along."""
+        """The portrait in another world; it looks the same to cameras that are taken along.
+
+        Raises:
+            PortraitError: It has a decoder that cannot be taken there.
+        """
         turn = torch.as_tensor(similarity.rotation).to(self.points)
         scale = similarity.scale
         moved = scale * (self.points @ turn.T) + torch.as_tensor(similarity.translation).to(self.points)
@@ -107,6 +120,7 @@ class Portrait:
             spacing=scale * self.spacing,
             c_flash=_vector([scale**2 * value for value in self.c_flash]),  # it is divided by d^2
             flash_offset_cam_m=_vector([scale * value for value in self.flash_offset_cam_m]),
+            decoder=None if self.decoder is None else self.decoder.transformed(similarity),
         )
 
     def save(self, folder: Path) -> None:
@@ -115,9 +129,14 @@ class Portrait:
         tensors = {name: getattr(self, name).detach().cpu().float().clone() for name in _TENSORS}
         content = {"schema": "relight-portrait", "version": VERSION, "points": len(self.points)}
         for field in fields(self):
-            if field.name not in _TENSORS and field.name != "reflectance":
+            if field.name not in _TENSORS and field.name not in ("reflectance", "decoder"):
                 content[field.name] = getattr(self, field.name)
         content["reflectance"] = asdict(self.reflectance)
+        content["decoder"] = None
+        if self.decoder is not None:
+            content["decoder"] = {"kind": self.decoder.kind, "settings": self.decoder.settings()}
+            for name, values in self.decoder.tensors().items():
+                tensors[_DECODER + name] = values.detach().cpu().contiguous().clone()
         text = (
             json.dumps(content, indent=2, allow_nan=False) + "\n"
         )  # before a file is touched: this can fail
@@ -146,9 +165,9 @@ def load_portrait(folder: Path, device: torch.device | str = "cpu") -> Portrait:
         raise PortraitError(
             f"{folder / FIELDS_FILE} cannot be read ({error}); fit the portrait again."
         ) from error
-    if version != VERSION:
+    if version not in _READ:
         raise PortraitError(
-            f"{folder / FIELDS_FILE} has version {version}, this program reads version {VERSION}; "
+            f"{folder / FIELDS_FILE} has version {version}, this program reads version {VERSION} and older; "
             "update the program or fit the portrait again."
         )
     try:
@@ -168,9 +187,24 @@ def load_portrait(folder: Path, device: torch.device | str = "cpu") -> Portrait:
             flash_offset_cam_m=_vector(content["flash_offset_cam_m"]),
             reflectance=_reflectance(**content["reflectance"]),
             info=dict(content["info"]),
+            decoder=_decoder(content["decoder"], tensors) if version > 1 else None,
         )
+    except PortraitError as error:
+        raise PortraitError(f"The portrait in {folder} cannot be read: {error}") from error
     except (SafetensorError, OSError, ValueError, KeyError, TypeError, OverflowError) as error:
         raise PortraitError(f"The portrait in {folder} is damaged ({error}); fit it again.") from error
+
+
+def _decoder(content: Any, tensors: Mapping[str, torch.Tensor]) -> Decoder | None:
+    if content is None:
+        return None
+    own = {
+        name.removeprefix(_DECODER): values for name, values in tensors.items() if name.startswith(_DECODER)
+    }
+    for name, values in own.items():
+        if values.is_floating_point() and not values.isfinite().all():
+            raise ValueError(f"{_DECODER}{name} is not finite")
+    return restored_decoder(content["kind"], dict(content["settings"]), own)
 
 
 def _positive(value: Any) -> float:

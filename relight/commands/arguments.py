@@ -100,7 +100,8 @@ def add_max_seconds(parser: argparse.ArgumentParser) -> None:
         "--max-seconds",
         type=positive_number,
         metavar="S",
-        help="leave out unlit frames until the fit should end within this time",
+        help="the fit should end within this time: unlit frames are left out until the solve does, and a "
+        "refinement gives the best it has by then",
     )
 
 

@@ -53,6 +53,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--fresh", action="store_true", help="do again what an earlier run left, though nothing has changed"
     )
+    parser.add_argument(
+        "--seed", type=int, default=0, metavar="N", help="of what a refinement draws by chance (default: 0)"
+    )
     add_max_seconds(parser)
     add_device(parser)
     add_forced(parser)
@@ -78,6 +81,7 @@ def run(args: argparse.Namespace) -> None:
             name=args.name,
             forced=forced,
             geometry=geometry,
+            seed=args.seed,
             fresh=args.fresh,
             progress=progress,
         )

@@ -1,0 +1,85 @@
+"""How a portrait can be fitted: the photometric solve, and what refines it afterwards.
+
+Every preset begins with the solve, for each needs its surface, its carving by the masks and its first guess
+of the lights. The module of a refinement is imported when it is asked for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields
+from importlib import import_module
+from typing import Any
+
+from relight.errors import PlanError
+from relight.portrait import Portrait
+
+Refine = Callable[..., Portrait]
+"""refine(scene: Scene, solved: Portrait, *, config, seconds: float | None, face: FacePrior | None,
+checkpoint: Path | None, seed: int, progress: Progress) -> Portrait
+
+`config` is what the preset's `make_config` gives. `seconds` is wall-clock time that it may take: it gives the
+best it has by then. `checkpoint` is a folder of its own, which may hold what an earlier run of it left from
+the same scene and seed; whether that was of the same configuration is for the refinement to tell. The same
+seed on the same device gives the same portrait. Sentences for the user go into the portrait's info under
+"warnings"."""
+
+
+@dataclass(frozen=True)
+class Preset:
+    """Where a preset's parts are, as "module:name".
+
+    Attributes:
+        refine: A `Refine`; None = the solve alone.
+        make_config: Without arguments gives its configuration, a frozen dataclass whose fields are its
+            arguments; None = it has none.
+    """
+
+    refine: str | None = None
+    make_config: str | None = None
+
+    def load_refine(self) -> Refine | None:
+        """The refinement, if there is one."""
+        return None if self.refine is None else _loaded(self.refine)
+
+    def config(self, settings: Mapping[str, Any]) -> Any:
+        """The configuration with some settings other than usual; None where there is nothing to set.
+
+        Raises:
+            PlanError: There is no such setting; the message lists those that there are.
+        """
+        usual = None if self.make_config is None else _loaded(self.make_config)()
+        known = [] if usual is None else [field.name for field in fields(usual)]
+        if unknown := sorted(settings.keys() - set(known)):
+            listed = f"it has {', '.join(sorted(known))}" if known else "it has none"
+            raise PlanError(f"The preset has no setting {unknown[0]!r}; {listed}.")
+        return usual if self.make_config is None else _loaded(self.make_config)(**settings)
+
+
+PRESETS: dict[str, Preset] = {
+    "solve": Preset(),
+}
+
+PRESETS_TO_COME = ("fast", "balanced", "paper")
+
+
+def chosen_preset(name: str) -> Preset:
+    """The preset of a name.
+
+    Raises:
+        PlanError: There is none, or not yet.
+    """
+    if name in PRESETS:
+        return PRESETS[name]
+    if name in PRESETS_TO_COME:
+        raise PlanError(
+            f"The preset {name!r} is a neural refinement, which is still to come; use --preset solve, "
+            "the photometric solve that it will start from."
+        )
+    known = ", ".join((*PRESETS, *PRESETS_TO_COME))
+    raise PlanError(f"There is no preset {name!r}; known are {known}, and {', '.join(PRESETS)} today.")
+
+
+def _loaded(place: str) -> Any:
+    module, _, name = place.partition(":")
+    return getattr(import_module(module), name)

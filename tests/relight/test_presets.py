@@ -1,0 +1,84 @@
+"""A preset's refinement follows the solve, gets what it needs, and its portrait is what is saved."""
+
+import json
+
+import pytest
+from analytic_scene import Head, arc, cloud_of, expose, photograph, write_session
+
+from capture.ply import PointCloud
+from relight.decoder import KINDS
+from relight.errors import PlanError
+from relight.fit import fit
+from relight.portrait import load_portrait
+from relight.presets import PRESETS, PRESETS_TO_COME, Preset, chosen_preset
+
+PLAIN = Preset("plain_decoder:refine", "plain_decoder:PlainConfig")
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory):
+    """A small session that can be solved."""
+    head = Head()
+    frames = [expose(head, photograph(head, camera), 1.0) for camera in arc(size=64)]
+    points, normals = cloud_of(head, 3000, 0.0004)
+    path = tmp_path_factory.mktemp("fit") / "S"
+    return write_session(path, frames, PointCloud(points, normals)).path
+
+
+@pytest.fixture(autouse=True)
+def plain_preset(monkeypatch):
+    monkeypatch.setitem(KINDS, "plain", "plain_decoder:PlainDecoder")
+    monkeypatch.setitem(PRESETS, "plain", PLAIN)
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_every_preset_can_be_loaded(name):
+    preset = chosen_preset(name)
+    assert (preset.load_refine() is None) == (preset.refine is None)
+    assert (preset.config({}) is None) == (preset.make_config is None)
+
+
+def test_no_preset_is_both_there_and_to_come():
+    assert not set(PRESETS) & set(PRESETS_TO_COME)
+
+
+def test_an_unknown_setting_is_refused_with_those_that_there_are():
+    assert PLAIN.config({"factor": 0.5}).factor == 0.5
+    with pytest.raises(PlanError, match=r"no setting 'steps'; it has factor\."):
+        PLAIN.config({"steps": 1})
+    with pytest.raises(PlanError, match="it has none"):
+        Preset().config({"steps": 1})
+
+
+def test_the_refined_portrait_is_saved_with_its_decoder_and_settings(session):
+    folder = fit(session, "plain", device="cpu", max_seconds=1e6, settings={"factor": 0.5}, seed=7)
+    portrait = load_portrait(folder)
+    assert portrait.decoder.factor == 0.5
+    assert portrait.info["seed"] == 7
+    # Of the limit, what the solve took and what is kept for pictures and report is gone.
+    assert 0.99e6 < portrait.info["seconds"] < 1e6
+    config = json.loads((folder / "config.json").read_text())
+    assert config["refinement"] == {"factor": 0.5}
+    assert config["seed"] == 7
+    metrics = json.loads((folder / "metrics.json").read_text())
+    assert "Refined." in metrics["warnings"]
+    assert "refine" in metrics["seconds"]
+
+
+def test_a_second_fit_goes_on_from_the_checkpoint_unless_the_seed_is_another(session):
+    runs = []
+    for settings, seed, fresh in [
+        ({}, 1, False),
+        ({}, 1, False),  # nothing has changed: kept
+        ({"factor": 0.25}, 1, False),  # runs again, on the same checkpoint
+        ({"factor": 0.25}, 2, False),
+        ({"factor": 0.25}, 2, True),
+    ]:
+        folder = fit(session, "plain", device="cpu", name="again", settings=settings, seed=seed, fresh=fresh)
+        runs.append(load_portrait(folder).info["runs"])
+    assert runs == [1, 1, 2, 1, 1]
+
+
+def test_without_time_left_a_refinement_is_asked_for_the_best_it_has(session):
+    folder = fit(session, "plain", device="cpu", name="short", max_seconds=0.01)
+    assert load_portrait(folder).info["seconds"] == 0.0
