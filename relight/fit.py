@@ -174,14 +174,14 @@ def fit(
     }
     _write_json(folder / "metrics.json", metrics)
     # Last, because its key says that all of the portrait is there.
-    resolved = {"key": key, "preset": preset, "solve": asdict(config), "geometry": asdict(geometry)}
+    resolved: dict[str, Any] = {
+        "key": key,
+        "preset": preset,
+        "solve": asdict(config),
+        "geometry": asdict(geometry),
+    }
     if refine is not None:
-        resolved = {
-            **resolved,
-            "refinement": asdict(refinement),
-            "seed": seed,
-            "max_seconds": max_seconds,
-        }
+        resolved |= {"refinement": asdict(refinement), "seed": seed, "max_seconds": max_seconds}
     _write_json(folder / "config.json", resolved)
     write_report(session, name)
     return folder
