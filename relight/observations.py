@@ -57,7 +57,9 @@ def observe_points(scene: Scene, surface: SurfaceCloud, progress: Progress = no_
     for k, view in enumerate(scene.views):
         observation = scene.observe(view)
         uv_px, slant, inside = visible_points(points, normals, view.camera, surface.spacing)
-        layers = [observation.radiance.permute(2, 0, 1), observation.valid[None]]
+        # What is no measurement may be anything, and of NaN a thousandth in the bilinear sum is NaN as well.
+        measured = observation.radiance.where(observation.valid[..., None] > 0, 0.0)
+        layers = [measured.permute(2, 0, 1), observation.valid[None]]
         if observation.mask is not None:
             layers.append(_eroded(observation.mask)[None])
         seen = (slant > _GRAZING).nonzero()[:, 0]

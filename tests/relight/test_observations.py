@@ -154,6 +154,18 @@ def test_clipped_pixels_and_their_neighbours_have_no_weight():
     np.testing.assert_allclose(observed.radiance[0, seen], 0.3, rtol=1e-5)
 
 
+@pytest.mark.parametrize("value", [np.nan, np.inf, 1e30])
+def test_what_is_no_measurement_does_not_reach_its_neighbours(value):
+    # The point lies a two-thousandth of a pixel towards the broken one: it is trusted, and its sample has that share.
+    point = np.array([[(20.5005 - 32) * 0.6 / (1.75 * 64), 0.0, 0.0]], np.float32)
+    radiance = np.full((64, 64, 3), 0.3)
+    radiance[:, 21] = value
+    scene = flat_scene(radiance, np.ones((64, 64), bool), point, point, with_masks=False)
+    observed = observe_points(scene, surface_of(point, np.array([[0.0, 0.0, 1.0]])))
+    assert observed.cosine[0, 0] > 0.9
+    np.testing.assert_allclose(observed.radiance[0, 0], 0.3, rtol=1e-3)  # the share
+
+
 def test_off_the_mask_and_at_its_edge_points_have_no_weight_and_count_as_outside():
     points, normals = ball(CENTRES[0], RADII[0])
     hit = np.zeros((64, 64), bool)
