@@ -156,7 +156,7 @@ def test_clipped_pixels_and_their_neighbours_have_no_weight():
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, 1e30])
 def test_what_is_no_measurement_does_not_reach_its_neighbours(value):
-    # The point lies a two-thousandth of a pixel towards the broken one: it is trusted, and its sample has that share.
+    # The point lies a two-thousandth of a pixel towards the broken one: it is trusted, with that share of it.
     point = np.array([[(20.5005 - 32) * 0.6 / (1.75 * 64), 0.0, 0.0]], np.float32)
     radiance = np.full((64, 64, 3), 0.3)
     radiance[:, 21] = value
