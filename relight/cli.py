@@ -31,6 +31,7 @@ _COMMANDS = {
         "relight.commands.doctor",
         "what is plugged in, what works, and what to do about what does not",
     ),
+    "stress": ("relight.commands.stress", "every stage under hostile inputs: numerical stability as a table"),
 }
 
 _ABOUT = "From a blinking flash to a relightable head."

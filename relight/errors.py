@@ -5,6 +5,7 @@ RelightError
 ├── PlanError        a session cannot be fitted as it is, or a decision cannot be forced
 │   └── GeometryError poses, cloud or masks cannot be found in the frames
 ├── PortraitError    a portrait is missing or cannot be read
+├── StressError      a stage is not stable under some input
 └── TruthError       a folder with ground truth cannot be used
 
 Every message is one sentence for the user: what is wrong, with its name, value and limit, and what to do
@@ -28,6 +29,10 @@ class GeometryError(PlanError):
 
 class PortraitError(RelightError):
     """A portrait is missing or cannot be read."""
+
+
+class StressError(RelightError):
+    """A stage is not numerically stable under some input, or no such case is known."""
 
 
 class TruthError(RelightError):
