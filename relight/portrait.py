@@ -124,7 +124,11 @@ class Portrait:
         )
 
     def save(self, folder: Path) -> None:
-        """Writes the two files; each is there whole or not at all."""
+        """Writes the two files; each is there whole or not at all.
+
+        Raises:
+            PortraitError: A value is not finite; nothing is written, for it could not be read again.
+        """
         folder.mkdir(parents=True, exist_ok=True)
         tensors = {name: getattr(self, name).detach().cpu().float().clone() for name in _TENSORS}
         content = {"schema": "relight-portrait", "version": VERSION, "points": len(self.points)}
@@ -137,6 +141,12 @@ class Portrait:
             content["decoder"] = {"kind": self.decoder.kind, "settings": self.decoder.settings()}
             for name, values in self.decoder.tensors().items():
                 tensors[_DECODER + name] = values.detach().cpu().contiguous().clone()
+        for name, values in tensors.items():
+            if broken := int((~values.isfinite()).sum()):
+                raise PortraitError(
+                    f"The portrait is not written to {folder}, for {broken} of the {values.numel()} values of its "
+                    f"{name} are not finite; a portrait that was there is untouched."
+                )
         text = (
             json.dumps(content, indent=2, allow_nan=False) + "\n"
         )  # before a file is touched: this can fail

@@ -88,6 +88,16 @@ def test_a_portrait_that_cannot_be_written_leaves_the_old_one(saved):
     assert [(saved / file).read_bytes() for file in (FIELDS_FILE, TENSORS_FILE)] == before
 
 
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_portrait_that_could_not_be_read_again_is_not_written(saved, value):
+    before = [(saved / file).read_bytes() for file in (FIELDS_FILE, TENSORS_FILE)]
+    albedo = np.full((2, 3), 0.5)
+    albedo[1, 2] = value
+    with pytest.raises(PortraitError, match="1 of the 6 values of its albedo are not finite"):
+        portrait_of(np.zeros((2, 3)), np.zeros((2, 3)), 1.0, albedo=albedo).save(saved)
+    assert [(saved / file).read_bytes() for file in (FIELDS_FILE, TENSORS_FILE)] == before
+
+
 def test_a_subset_has_the_chosen_points():
     portrait = some_portrait()
     keep = torch.arange(7) % 2 == 0
