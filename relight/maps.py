@@ -18,9 +18,11 @@ import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.sparse import csc_array
 
 from capture.cameras import Camera
-from relight.observations import visible_points
+from relight.observations import sample_bilinear
+from relight.occlusion import Sight
 from relight.portrait import Portrait
 from relight.raster import NEAR_M, IdPyramid, project, rasterize_ids
 
@@ -33,6 +35,9 @@ _TRACE = 1e-3  # of coverage, beyond the outline: if that errs by a pixel there 
 _GRAZING = 0.02  # cosine under which a point does not face the view
 _CELL, _TOLERANCE = 2.4, 5.0  # of the visibility test, in spacings: finer than for observing, edges show
 _ENCLOSED_SHARE = 0.01  # of the mask: larger enclosed gaps are the subject's, e.g. under a bent arm
+_MARGIN_PX = 4  # of a splat, the closing of gaps and the mask's soft edge
+_COARSE_PX = 32  # of a level that fills gaps; wider ones are rare
+_VALUES = 13  # of a pixel: normal, albedo, room radiance, shading, confidence, gloss, depth
 _ID_LEVELS = 4  # pixels without a point of their own take that of a coarser level
 
 
@@ -52,6 +57,8 @@ class Maps:
         confidence: [H, W] 0..1.
         gloss: [H, W] factor on the reflectance's f0.
         point_ids: [H, W] int64, a point of the portrait seen in or near the pixel, -1 off the subject.
+        flash_radiance: [H, W, 3] linear radiance that the camera's own flash adds, where a decoder has a
+            light model of its own for it; None = it follows from the other maps.
     """
 
     albedo: torch.Tensor
@@ -64,6 +71,7 @@ class Maps:
     confidence: torch.Tensor
     gloss: torch.Tensor
     point_ids: torch.Tensor
+    flash_radiance: torch.Tensor | None = None
 
 
 def render_maps(portrait: Portrait, camera: Camera) -> Maps:
@@ -105,7 +113,7 @@ def splat_maps(portrait: Portrait, camera: Camera) -> Maps:
         shading=values[..., 9].clamp(0.0, 1.0),
         mask=mask,
         depth=depth,
-        points_world=torch.where(support, _unproject(depth, camera), 0.0),
+        points_world=torch.where(support, unproject(depth, camera), 0.0),
         confidence=values[..., 10].clamp(0.0, 1.0),
         gloss=values[..., 11].clamp(min=0.0),
         point_ids=point_ids,
@@ -126,15 +134,22 @@ def _drawn_share(portrait: Portrait, camera: Camera) -> float:
 def _draw(portrait: Portrait, camera: Camera) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Values [H, W, 13], mask [H, W] and point ids [H, W] of a view."""
     height, width = camera.height, camera.width
-    surface = portrait.points, portrait.normals_world, camera, portrait.spacing
-    uv_px, cosine, _ = visible_points(*surface, cell=_CELL, tolerance=_TOLERANCE)
-    _, behind, _ = visible_points(*surface, cell=_CELL, tolerance=_TOLERANCE, margin=False)
-    surely = cosine > _GRAZING
-    seen = (surely | (behind > _GRAZING)).nonzero()[:, 0]
-    points, cosine, surely = portrait.points[seen], torch.maximum(cosine, behind)[seen], surely[seen]
-    rotation = torch.as_tensor(camera.cam_from_world).to(points)
-    z = points @ rotation[2, :3] + rotation[2, 3]
-    values = torch.cat(
+    sight = Sight(portrait.points, portrait.normals_world, camera, portrait.spacing, _CELL, _TOLERANCE)
+    facing = (sight.cosine > _GRAZING).nonzero()[:, 0]
+    surely = sight.unhidden(facing)
+    kept = surely | sight.unhidden(facing, margin=False)
+    seen, surely = facing[kept], surely[kept]
+    values = torch.zeros(height, width, _VALUES).to(portrait.points)
+    if not len(seen):
+        return values, values[..., 0], torch.full((height, width), -1, device=values.device)
+    uv_px, z = sight.uv_px[seen], sight.z[seen]
+    natural_px = _WIDTH * portrait.spacing * float(camera.K[0, 0]) / z.clamp(min=1e-9)
+    spread_px = natural_px.clamp(min=_NARROWEST_PX)
+    # Slanted surfaces have more points a pixel, splats that are kept from being too narrow overlap more, and
+    # of wide ones a part lies outside of 3x3 pixels: with these weights the sum is 2 pi _WIDTH^2 everywhere.
+    weight = sight.cosine[seen].clamp(min=0.1) * (natural_px / spread_px) ** 2
+    weight = weight / torch.erf(1.5 / math.sqrt(2.0) / spread_px) ** 2
+    rows = torch.cat(
         [
             portrait.normals_world[seen],
             portrait.albedo[seen],
@@ -143,27 +158,43 @@ def _draw(portrait: Portrait, camera: Camera) -> tuple[torch.Tensor, torch.Tenso
             portrait.confidence[seen, None],
             portrait.gloss[seen, None],
             z[:, None],
+            torch.ones_like(z)[:, None],
         ],
         dim=1,
     )
-    natural_px = _WIDTH * portrait.spacing * float(camera.K[0, 0]) / z.clamp(min=1e-9)
-    spread_px = natural_px.clamp(min=_NARROWEST_PX)
-    # Slanted surfaces have more points a pixel, splats that are kept from being too narrow overlap more, and
-    # of wide ones a part lies outside of 3x3 pixels: with these weights the sum is 2 pi _WIDTH^2 everywhere.
-    weight = cosine.clamp(min=0.1) * (natural_px / spread_px) ** 2
-    weight = weight / torch.erf(1.5 / math.sqrt(2.0) / spread_px) ** 2
-    uv_px = uv_px[seen]
-    sums, rest = (
-        _splat(values[part], uv_px[part], spread_px[part], weight[part], height, width)
-        for part in (surely, ~surely)
-    )
+    window, corner = _window(uv_px, height, width)
+    size = tuple(side.stop - side.start for side in window)
+    sums = _splat(rows, uv_px - corner, spread_px, weight, surely, size)
     # Close behind an outline, as of the chin before the neck, only the points without a margin reach.
-    sums = torch.where(sums[-1] > _COVERED, sums, sums + rest)
-    inside = sums[-1] > _INSIDE * 2.0 * math.pi * _WIDTH**2
-    support = _soft_mask((sums[-1] > _COVERED).cpu().numpy()).to(sums) > 0
-    mask = torch.where(support, _soft_mask(inside.cpu().numpy()).to(sums).clamp(min=_TRACE), 0.0)
-    ids = _point_ids(rasterize_ids(points, camera, _ID_LEVELS), seen, support)
-    return pull_push(sums, _COVERED).permute(1, 2, 0), mask, ids
+    sums = torch.where(sums[0, -1:] > _COVERED, sums[0], sums.sum(dim=0))
+    covered, inside = (
+        torch.nn.functional.pad(sums[-1] > least, _around(window, height, width)).cpu().numpy()
+        for least in (_COVERED, _INSIDE * 2.0 * math.pi * _WIDTH**2)
+    )
+    support = _soft_mask(covered).to(sums) > 0
+    mask = torch.where(support, _soft_mask(inside).to(sums).clamp(min=_TRACE), 0.0)
+    # What lies beyond the window is off the subject but for the mask's soft edge.
+    values[window] = pull_push(sums, _COVERED, support[window]).permute(1, 2, 0)
+    ids = _point_ids(rasterize_ids(portrait.points[seen], camera, _ID_LEVELS), seen, support)
+    return values, mask, ids
+
+
+def _window(uv_px: torch.Tensor, height: int, width: int) -> tuple[tuple[slice, slice], torch.Tensor]:
+    """Rows and columns of the picture that splats about uv_px [P, 2] reach, and the first of them as u, v.
+
+    A head fills half of its picture, and the rest costs nothing. A margin holds the mask's soft edge, and the
+    window begins and ends where a coarse level's pixels do, so that gaps are filled as in the whole picture.
+    """
+    low = (uv_px.amin(dim=0).floor().long() - _MARGIN_PX).clamp(min=0) // _COARSE_PX * _COARSE_PX
+    high = uv_px.amax(dim=0).floor().long() + _MARGIN_PX + _COARSE_PX
+    (left, top), (right, bottom) = low.tolist(), (high // _COARSE_PX * _COARSE_PX).tolist()
+    return (slice(top, min(height, bottom)), slice(left, min(width, right))), low.to(uv_px)
+
+
+def _around(window: tuple[slice, slice], height: int, width: int) -> list[int]:
+    """Pixels left, right, above and below a window, as `pad` takes them."""
+    rows, columns = window
+    return [columns.start, width - columns.stop, rows.start, height - rows.stop]
 
 
 def _enlarged(
@@ -183,40 +214,53 @@ def _enlarged(
     )
 
 
-def pull_push(sums: torch.Tensor, full: float) -> torch.Tensor:
+def pull_push(sums: torch.Tensor, full: float, wanted: torch.Tensor | None = None) -> torch.Tensor:
     """Fills an image where it has little or no weight, smoothly, from where it has.
 
     Args:
         sums: [C + 1, H, W], weighted sums and, last, the weights.
         full: Weight from which a pixel needs nothing of its surroundings.
+        wanted: [H, W] bool, pixels whose values matter, by default all; elsewhere they mean nothing.
 
     Returns:
         [C, H, W], 0 everywhere if there are no weights at all.
     """
-    weight = sums[-1:]
-    share = (weight / full).clamp(max=1.0)
-    values = torch.where(weight > 0, sums[:-1] / weight.clamp(min=1e-20), 0.0)
-    pyramid = [(values, share)]
-    while max(pyramid[-1][0].shape[1:]) > 1:
-        values, share = pyramid[-1]
-        pooled = _pool(torch.cat([values * share, share]))
-        total = pooled[-1:]
-        values = torch.where(total > 0, pooled[:-1] / total.clamp(min=1e-20), 0.0)
-        pyramid.append((values, (4.0 * total).clamp(max=1.0)))
-    values, share = pyramid.pop()
-    for finer, finer_share in reversed(pyramid):
-        # What the coarser level knows is weighted by how much it knows, or empty pixels would darken their
-        # neighbours.
-        both = torch.nn.functional.interpolate(
-            torch.cat([values * share, share])[None],
-            size=finer.shape[1:],
-            mode="bilinear",
-            align_corners=False,
+    # Values times their share (how much is known of them, 0..1), and last the share: when levels are mixed,
+    # what knows little counts for little, or empty pixels would darken their neighbours.
+    finest = sums / sums[-1:].clamp(min=full)
+    if max(sums.shape[1:]) == 1:
+        return finest[:-1] / finest[-1:].clamp(min=1e-20)
+    coarser = []
+    level = finest
+    while max(level.shape[1:]) > 1:
+        level = _pool(level)
+        level = level / level[-1:].clamp(min=0.25)  # a quarter of the pixels are enough for a share of 1
+        coarser.append(level)
+    filled = coarser.pop()
+    for level in reversed(coarser):
+        around = torch.nn.functional.interpolate(
+            filled[None], size=level.shape[1:], mode="bilinear", align_corners=False
         )[0]
-        around = torch.where(both[-1:] > 0, both[:-1] / both[-1:].clamp(min=1e-20), 0.0)
-        values = finer_share * finer + (1.0 - finer_share) * around
-        share = torch.maximum(finer_share, (both[-1:] > 0).to(both))
+        filled = torch.cat([_completed(level, around), (around[-1:] > 0).to(around)])
+    missing = finest[-1] < 1.0 if wanted is None else (finest[-1] < 1.0) & wanted
+    rows, columns = missing.nonzero().unbind(1)
+    values = finest[:-1]
+    # The same interpolation, where it is needed: at the finest level most pixels are known.
+    uv_px = torch.stack([columns, rows], dim=1) + 0.5
+    uv_px = uv_px * uv_px.new_tensor([size / whole for size, whole in _sides(filled, finest)])
+    around = sample_bilinear(filled, uv_px.to(filled)).T
+    values[:, rows, columns] = _completed(finest[:, rows, columns], around)
     return values
+
+
+def _completed(level: torch.Tensor, around: torch.Tensor) -> torch.Tensor:
+    """Values [C, ...] of a level [C + 1, ...], for what is missing of their share those around them."""
+    return level[:-1] + (1.0 - level[-1:]) * around[:-1] / around[-1:].clamp(min=1e-20)
+
+
+def _sides(image: torch.Tensor, larger: torch.Tensor) -> list[tuple[int, int]]:
+    """Widths and heights of two images [C, H, W]."""
+    return [(image.shape[side], larger.shape[side]) for side in (2, 1)]
 
 
 def _pool(image: torch.Tensor) -> torch.Tensor:
@@ -227,28 +271,43 @@ def _pool(image: torch.Tensor) -> torch.Tensor:
 
 
 def _splat(
-    values: torch.Tensor,
+    rows: torch.Tensor,
     uv_px: torch.Tensor,
     spread_px: torch.Tensor,
     weight: torch.Tensor,
-    height: int,
-    width: int,
+    first: torch.Tensor,
+    size: tuple[int, int],
 ) -> torch.Tensor:
-    """Sums [C + 1, H, W] of values [P, C] under Gaussians about uv_px [P, 2], and of their weights."""
-    padded = width + 2  # a frame of one pixel takes what falls outside
-    sums = values.new_zeros((height + 2) * padded, values.shape[1] + 1)
-    rows = torch.cat([values, torch.ones_like(values[:, :1])], dim=1)
+    """Sums [2, C, H, W] of rows [P, C] under Gaussians about uv_px [P, 2]: the `first` [P], then others."""
+    padded = size[0] + 2, size[1] + 2  # a frame of one pixel takes what falls outside
+    pixels = padded[0] * padded[1]
     corner = uv_px.floor()
     offset = uv_px - corner - 0.5
-    place = (corner[:, 1].long() + 1) * padded + corner[:, 0].long() + 1
+    place = (corner[:, 1].int() + 1) * padded[1] + corner[:, 0].int() + 1
+    place = torch.where(first, place, place + pixels)
+    step = torch.arange(-1, 2, device=uv_px.device)
     falloff = -0.5 / spread_px**2
-    for dy in (-1, 0, 1):
-        for dx in (-1, 0, 1):
-            square = (dx - offset[:, 0]) ** 2 + (dy - offset[:, 1]) ** 2
-            sums.index_add_(
-                0, place + dy * padded + dx, rows * (weight * torch.exp(square * falloff))[:, None]
-            )
-    return sums.view(height + 2, padded, -1)[1:-1, 1:-1].permute(2, 0, 1).contiguous()
+    across, down = (torch.exp((step - offset[:, axis, None]) ** 2 * falloff[:, None]) for axis in (0, 1))
+    shares = (down * weight[:, None])[:, :, None] * across[:, None]
+    places = place[:, None] + (step[:, None] * padded[1] + step).flatten().int()
+    sums = _add_at(places, shares.flatten(1), rows, 2 * pixels)
+    return sums.view(2, *padded, -1)[:, 1:-1, 1:-1].permute(0, 3, 1, 2).contiguous()
+
+
+def _add_at(places: torch.Tensor, shares: torch.Tensor, rows: torch.Tensor, count: int) -> torch.Tensor:
+    """Sums [count, C] of rows [P, C] at K places [P, K] each, times their shares [P, K].
+
+    On a CPU as the product with a sparse matrix in scipy, which goes through the points once: three times as
+    fast as torch's `index_add_`, and with no copy of the rows a place.
+    """
+    if rows.device.type != "cpu":
+        sums = rows.new_zeros(count, rows.shape[1])
+        for place, share in zip(places.long().unbind(1), shares.unbind(1), strict=True):
+            sums.index_add_(0, place, rows * share[:, None])
+        return sums
+    starts = np.arange(len(places) + 1, dtype=np.int32) * places.shape[1]
+    matrix = csc_array((shares.numpy().ravel(), places.numpy().ravel(), starts), shape=(count, len(places)))
+    return torch.from_numpy(matrix @ rows.numpy())
 
 
 def _soft_mask(covered: NDArray[np.bool_]) -> torch.Tensor:
@@ -256,12 +315,12 @@ def _soft_mask(covered: NDArray[np.bool_]) -> torch.Tensor:
     pixels soft."""
     mask = cv2.morphologyEx(covered.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
     height, width = mask.shape
-    count, labels, statistics, _ = cv2.connectedComponentsWithStats(1 - mask, connectivity=4)
-    for label in range(1, count):
-        left, top, columns, rows, area = statistics[label]
-        inside = left > 0 and top > 0 and left + columns < width and top + rows < height
-        if inside and area < _ENCLOSED_SHARE * mask.sum():
-            mask[labels == label] = 1
+    _, labels, statistics, _ = cv2.connectedComponentsWithStats(1 - mask, connectivity=4)
+    left, top, columns, rows, area = statistics.T
+    small = (left > 0) & (top > 0) & (left + columns < width) & (top + rows < height)
+    small &= area < _ENCLOSED_SHARE * mask.sum()
+    small[0] = False  # what is covered
+    mask[small[labels]] = 1
     # Reflected at the border: a subject cut by the picture's edge does not fade there.
     return torch.from_numpy(
         cv2.GaussianBlur(mask.astype(np.float32), (5, 5), 0.7, borderType=cv2.BORDER_REPLICATE)
@@ -282,7 +341,7 @@ def _point_ids(pyramid: IdPyramid, seen: torch.Tensor, support: torch.Tensor) ->
     return result
 
 
-def _unproject(depth: torch.Tensor, camera: Camera) -> torch.Tensor:
+def unproject(depth: torch.Tensor, camera: Camera) -> torch.Tensor:
     """World positions [H, W, 3] of the pixel centres at given depths [H, W]."""
     height, width = depth.shape
     v, u = torch.meshgrid(

@@ -1,8 +1,6 @@
 """What every point of the surface looks like in every frame that sees it.
 
-Occlusion is told from a z-buffer of cells a few points wide: the nearest depth in the 3x3 cells about a
-point, and a tolerance that grows with the slant of the surface across these cells. So no hole between
-points lets light through from behind, and a slanted surface does not hide itself.
+`relight.occlusion` tells which points a frame sees.
 """
 
 from __future__ import annotations
@@ -13,11 +11,10 @@ import torch
 
 from capture.cameras import Camera
 from relight.cloud import SurfaceCloud
-from relight.raster import NEAR_M, project
+from relight.occlusion import Sight
 from relight.scene import Scene
 from relight.stages import Progress, no_progress
 
-_SLANT = 2.0  # cells between a point and the nearest one of its 3x3 cells
 _GRAZING = 0.1  # cosine below which a frame says little of a point: 84 degrees
 _MASK_MARGIN_PX = 1  # at the edge of the mask a pixel mixes subject and background
 
@@ -92,14 +89,7 @@ def observe_points(scene: Scene, surface: SurfaceCloud, progress: Progress = no_
 
 
 def visible_points(
-    points: torch.Tensor,
-    normals: torch.Tensor,
-    camera: Camera,
-    spacing: float,
-    *,
-    cell: float = 4.8,
-    tolerance: float = 7.5,
-    margin: bool = True,
+    points: torch.Tensor, normals: torch.Tensor, camera: Camera, spacing: float, *, cell: float = 4.8
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Where points project and how they face a camera that sees them.
 
@@ -108,39 +98,19 @@ def visible_points(
         normals: [P, 3], unit, world.
         camera: Without distortion.
         spacing: Of the points, world units.
-        cell: Width of a z-buffer cell in spacings, and at least two pixels. With 4.8 some twenty points
-            fall into a cell and none is empty; smaller ones resolve finer occluders.
-        margin: Whether what is nearer in a neighbouring cell hides a point too. Without, nothing near an
-            outline is hidden wrongly, but what lies behind may show between the nearer surface's points.
-        tolerance: Depth in spacings that does not hide: the noise of a dense cloud stays within 7.5.
+        cell: As for `Sight`.
 
     Returns:
         uv_px [P, 2]; cosine [P] between the normal and the direction to the camera, 0 where the point is
         hidden, turned away or outside the picture; inside [P] bool, whether it projects into the picture at
         all.
     """
-    uv_px, z = project(points, camera)
-    u, v = uv_px.unbind(1)
-    inside = (z > NEAR_M) & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
-    if not inside.any():
-        return uv_px, torch.zeros_like(z), inside
-    focal_px = float(camera.K[0, 0])
-    cell_px = max(2.0, cell * spacing * focal_px / float(z[inside].median()))
-    columns, rows = int(camera.width / cell_px) + 1, int(camera.height / cell_px) + 1
-    # Outside the picture, behind the camera and for NaN any cell will do, for `inside` decides.
-    u, v = ((value / cell_px).where(inside, 0.0).long() for value in (u, v))
-    place = v * columns + u
-    nearest = z.new_full((rows * columns,), torch.inf)
-    nearest.scatter_reduce_(0, place[inside], z[inside], "amin")
-    if margin:
-        nearest = -torch.nn.functional.max_pool2d(-nearest.view(1, 1, rows, columns), 3, 1, 1).flatten()
-    towards = torch.as_tensor(camera.centre_world).to(points) - points
-    length = (towards * towards).sum(dim=1).sqrt()
-    cosine = (normals * towards).sum(dim=1) / length.clamp(min=1e-12)
-    slope = (1.0 - cosine**2).clamp(min=0.0).sqrt() / cosine.clamp(min=0.15)
-    allowed = tolerance * spacing + _SLANT * cell_px * z / focal_px * slope
-    seen = inside & (cosine > 0) & (z <= nearest[place] + allowed)
-    return uv_px, torch.where(seen, cosine, 0.0), inside
+    sight = Sight(points, normals, camera, spacing, cell)
+    facing = (sight.cosine > 0).nonzero()[:, 0]
+    seen = facing[sight.unhidden(facing)]
+    cosine = torch.zeros_like(sight.cosine)
+    cosine[seen] = sight.cosine[seen]
+    return sight.uv_px, cosine, sight.inside
 
 
 def sample_bilinear(image: torch.Tensor, uv_px: torch.Tensor) -> torch.Tensor:
