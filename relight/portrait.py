@@ -144,8 +144,8 @@ class Portrait:
         for name, values in tensors.items():
             if broken := int((~values.isfinite()).sum()):
                 raise PortraitError(
-                    f"The portrait is not written to {folder}, for {broken} of the {values.numel()} values of its "
-                    f"{name} are not finite; a portrait that was there is untouched."
+                    f"The portrait is not written to {folder}, for {broken} of the {values.numel()} values "
+                    f"of its {name} are not finite; a portrait that was there is untouched."
                 )
         text = (
             json.dumps(content, indent=2, allow_nan=False) + "\n"
