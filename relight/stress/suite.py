@@ -14,6 +14,7 @@ from relight.stress import (
     measures,
     observing,
     projecting,
+    reflecting,
     rendering,
     solving,
 )
@@ -24,6 +25,7 @@ _MODULES: tuple[Callable[[], Iterator[Case]], ...] = (
     solving.cases,
     projecting.cases,
     rendering.cases,
+    reflecting.cases,
     lights.cases,
     environments.cases,
     measures.cases,
