@@ -255,7 +255,9 @@ def pull_push(sums: torch.Tensor, full: float, wanted: torch.Tensor | None = Non
 
 def _completed(level: torch.Tensor, around: torch.Tensor) -> torch.Tensor:
     """Values [C, ...] of a level [C + 1, ...], for what is missing of their share those around them."""
-    return level[:-1] + (1.0 - level[-1:]) * around[:-1] / around[-1:].clamp(min=1e-20)
+    share = around[-1:]
+    # Divided by next to nothing, the nothing that is around an empty pixel would have an infinite gradient.
+    return level[:-1] + (1.0 - level[-1:]) * around[:-1] / share.where(share > 0, 1.0)
 
 
 def _sides(image: torch.Tensor, larger: torch.Tensor) -> list[tuple[int, int]]:

@@ -235,6 +235,15 @@ def test_pulling_and_pushing_nothing_gives_zero():
     assert not filled.any()
 
 
+def test_gradients_are_finite_where_nothing_is_known():
+    for corner in (0.0, 0.3):  # no weight at all, and a lone one far from the others
+        sums = torch.zeros(4, 33, 17)
+        sums[:, 0, 0] = corner
+        sums.requires_grad_()
+        (gradient,) = torch.autograd.grad(pull_push(sums, 0.05).sum(), sums)
+        assert gradient.isfinite().all()
+
+
 def test_pixels_with_enough_weight_keep_their_values():
     random = torch.Generator().manual_seed(0)
     values, weight = torch.rand(20, 20, generator=random), torch.full((20, 20), 0.05)
