@@ -23,7 +23,7 @@ from relight.lighting import (
     SphericalHarmonicsLight,
     shade,
 )
-from relight.maps import pull_push, render_maps
+from relight.maps import pull_push
 from relight.observations import sample_bilinear
 from relight.panorama import panorama_to_sh
 from relight.raster import gather_descriptors, project
@@ -39,7 +39,7 @@ from relight.spherical_harmonics import (
 )
 from relight.stress.case import Case, Measured, Stage, gradients_of
 from relight.stress.lights import kinds, panorama, points
-from relight.stress.subject import looking_at_origin, portrait, sphere_points
+from relight.stress.subject import looking_at_origin, sphere_points
 from relight.surface import cosine, cosine_falloff, direction_to
 
 GRADIENTS = Stage("gradients", (torch.float64,), "central differences need the digits of float64")
@@ -157,16 +157,6 @@ def _filled() -> Checked:
     return filled, {"values": _random(2, 7, 6), "more": 0.1 * _random(1, 7, 6, seed=3)}
 
 
-def _splatted() -> Checked:
-    made, camera = portrait(30, torch.float64), looking_at_origin([0.05, 0.1, 0.5], 6)
-
-    def maps(albedo: Tensor, normals: Tensor, shading: Tensor) -> tuple[Tensor, ...]:
-        drawn = render_maps(replace(made, albedo=albedo, normals_world=normals, shading=shading), camera)
-        return drawn.albedo, drawn.shading
-
-    return maps, {"albedo": made.albedo, "normals": made.normals_world, "shading": made.shading}
-
-
 def _environment() -> Checked:
     table = DiffuseIrradiance.of_panorama(np.ones((4, 8, 3)) * np.arange(1, 9)[None, :, None])
     smooth = DiffuseIrradiance(table.odd.double(), table.even.double())
@@ -186,7 +176,6 @@ _OPERATORS: dict[str, Made] = {
     "gather_descriptors": _gathered,
     "sample_bilinear": _sampled,
     "pull_push": _filled,
-    "render_maps": _splatted,
     "irradiance of a panorama": _environment,
     "sh_basis": lambda: (lambda d: sh_basis(d, 5), {"directions": torch.cat([torch.eye(3), _directions()])}),
     "sh_irradiance": lambda: (sh_irradiance, {"coefficients": _random(16, 3), "normals": _directions()}),

@@ -49,14 +49,13 @@ def _response(kind: Reflectance, dtype: torch.dtype) -> Measured:
     """Light and view in line, opposite, grazing, within the surface, behind it; and zero normals."""
     directions = torch.cat([torch.eye(3), -torch.eye(3), torch.from_numpy(sphere_points(10)).float()])
     normals = torch.cat([directions, torch.zeros(1, 3)])
-    n, l, v = torch.meshgrid(
-        *(torch.arange(len(d)) for d in (normals, directions, directions)), indexing="ij"
-    )
+    choices = [torch.arange(len(of)) for of in (normals, directions, directions)]
+    normal, light, view = torch.cartesian_prod(*choices).unbind(1)
     given = {
-        "albedo": torch.full((n.numel(), 3), 0.5),
-        "normals": normals[n.flatten()],
-        "to_light": directions[l.flatten()],
-        "to_view": directions[v.flatten()],
+        "albedo": torch.full((len(normal), 3), 0.5),
+        "normals": normals[normal],
+        "to_light": directions[light],
+        "to_view": directions[view],
     }
     inputs = {name: value.to(dtype).requires_grad_() for name, value in given.items()}
     values = kind.response(**inputs)

@@ -20,7 +20,7 @@ from relight.maps import Maps, render_maps
 from relight.portrait import Portrait
 from relight.raster import gather_descriptors, rasterize_ids
 from relight.shadows import ShadowCaster
-from relight.stress.case import Case, Measured, Stage, at_most, gradients_of
+from relight.stress.case import Case, Measured, Stage, at_most
 from relight.stress.projecting import NO_PLACES, PLACES, around
 from relight.stress.subject import Floats, looking_at_origin, portrait, sphere_points
 
@@ -97,19 +97,12 @@ _HARDLY_A_HEAD = {
 
 
 def _mapped(made: Made, camera: Camera, dtype: torch.dtype) -> Measured:
-    """Maps, and gradients in the values of the points that are splatted."""
-    given = made(dtype)
-    inputs = {
-        name: getattr(given, name).clone().requires_grad_() for name in ("albedo", "normals_world", "shading")
-    }
-    maps = render_maps(replace(given, **inputs), camera)
-    splatted = torch.cat([maps.albedo, maps.normals_world, maps.shading[..., None]], dim=-1)
-    return Measured(_values(maps), gradients_of(splatted, **inputs))
+    return Measured(_values(render_maps(made(dtype), camera)))
 
 
 def _values(maps: Maps) -> dict[str, Tensor]:
-    found = {name: value for name, value in vars(maps).items() if isinstance(value, Tensor)}
-    return {name: value.detach() for name, value in found.items() if value.dtype.is_floating_point}
+    tensors = {name: value for name, value in vars(maps).items() if isinstance(value, Tensor)}
+    return {name: value for name, value in tensors.items() if value.dtype.is_floating_point}
 
 
 def _lit(position: list[float], caster: ShadowCaster) -> Tensor:
