@@ -11,14 +11,20 @@ units:
     noise_read           [3] standard deviation of radiance at black
     noise_shot           [3] var = noise_read^2 + noise_shot * radiance
     flat_field           [n] a1, a2, ...: the lens passes 1 + a1 r^2 + a2 r^4 + ..., with r = distance from
-    the
-                         picture's centre over half its diagonal; radiance is divided by it
-    colour               [3, 3] linear camera RGB -> linear sRGB (primaries of IEC 61966-2-1)
+                         the picture's centre over half its diagonal; radiance is divided by it
+    colour               [3, 3] linear camera RGB -> linear sRGB (primaries of IEC 61966-2-1), in which white
+                         under the flash is grey; radiance is multiplied by it
+    room_white           [3] white under the room's light in the sRGB of `colour`, its mean 1: the colour of
+                         the room's light for one that takes the flash for white
     flash_offset_cam_m   [3] position of the flash in camera axes, m
     flash_axis           [3] unit direction in which the flash is strongest, camera axes
     flash_falloff        mu >= 0: the flash sends cos(angle to its axis)^mu, the model of an LED (Quéau et al.
                          2018); 0 = the same in every direction
-    flash_strength       [3] C_flash: radiance of a white Lambertian surface that faces the flash at 1 m, m^2
+    flash_strength       [3] C_flash: radiance of a white Lambertian surface that faces the flash at 1 m, m^2,
+                         in camera RGB
+
+An entry may say which settings of the camera it holds for ("made_with"); `session_calibration` leaves out
+those that do not hold for a session.
 """
 
 from __future__ import annotations
@@ -40,8 +46,16 @@ from capture.cameras import LARGEST_SIDE
 from capture.errors import CalibrationError
 from capture.json_fields import Fields
 from capture.response import Response, response_from_json
+from capture.session import Session
 
-__all__ = ["Calibration", "Intrinsics", "Quantity", "load_calibration", "save_calibration"]
+__all__ = [
+    "Calibration",
+    "Intrinsics",
+    "Quantity",
+    "load_calibration",
+    "save_calibration",
+    "session_calibration",
+]
 
 
 @dataclass(frozen=True)
@@ -67,6 +81,7 @@ _KINDS = {
         (1, 0, 0, 0, 1, 0, 0, 0, 1),
         "No colour matrix is known; camera RGB is taken as sRGB.",
     ),
+    "room_white": _Kind("1", (3,), 0.0, None, "No colour of the room's light is known; the fit finds it."),
     "flash_offset_cam_m": _Kind(
         "m", (3,), None, (0.0, 0.0, 0.0), "No flash position is known; it is taken to be at the lens."
     ),
@@ -116,6 +131,7 @@ class Calibration:
     noise_shot: Quantity | None = None
     flat_field: Quantity | None = None
     colour: Quantity | None = None
+    room_white: Quantity | None = None
     flash_offset_cam_m: Quantity | None = None
     flash_axis: Quantity | None = None
     flash_falloff: Quantity | None = None
@@ -151,7 +167,20 @@ def load_calibration(path: Path) -> Calibration:
     """
     if not path.is_file():
         return Calibration()
-    entries = read_calibration_entries(path)
+    return _calibration_of(read_calibration_entries(path))
+
+
+def session_calibration(session: Session) -> Calibration:
+    """What of a session's calibration holds for its frames: those entries that were made with its settings.
+
+    Raises:
+        CalibrationError: as `load_calibration`.
+    """
+    entries, _ = session.read_calibration()
+    return _calibration_of(entries)
+
+
+def _calibration_of(entries: Fields) -> Calibration:
     known = {field.name for field in fields(Calibration)}
     if unknown := sorted(entries.values.keys() - known - {"schema", "version"}):
         raise entries.fail(f"the entry {unknown[0]!r} is unknown (known: {', '.join(sorted(known))}).")

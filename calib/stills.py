@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from capture.controls import UNKNOWN, Controls, controls_of_session
 from capture.errors import ImageError, SourceError
 from capture.images import IMAGE_SUFFIXES, decode_image
 from capture.raw.tiff import read_directories
@@ -37,11 +38,13 @@ class Still:
         image: [H, W, 3] RGB or [H, W], uint8, uint16 or float32.
         exposure_s: exposure time, seconds, brought to the same sensitivity and aperture for all; None = not
             known.
+        controls: settings that it was taken with, as far as they are known.
     """
 
     name: str
     image: NDArray[Any]
     exposure_s: float | None
+    controls: Controls = UNKNOWN
 
 
 def read_stills(sources: Sequence[Path]) -> Iterator[Still]:
@@ -80,7 +83,13 @@ def _of_file(path: Path, exposure_s: float | None = None) -> Still:
         data = path.read_bytes()
     except OSError as cause:
         raise ImageError(f"{path} cannot be read: {cause.strerror or cause}.") from cause
-    return Still(path.name, decode_image(data, path), exposure_s or _exif_light(data))
+    image = decode_image(data, path)
+    found = _exif(data)
+    gain = found[_SENSITIVITY] / 100.0 if _SENSITIVITY in found else None
+    controls = Controls(
+        width=image.shape[1], height=image.shape[0], exposure_s=found.get(_EXPOSURE_TIME), gain=gain
+    )
+    return Still(path.name, image, exposure_s or _light(found), controls)
 
 
 def _of_list(path: Path) -> Iterator[Still]:
@@ -107,7 +116,8 @@ def _of_session(path: Path) -> Iterator[Still]:
     if not records:
         raise SourceError(f"{path} holds no pictures; give a session that keeps its frames.")
     for record in records:
-        yield Still(f"frame {record.index}", session.load_image(record), record.exposure_s)
+        own = controls_of_session(session.info, [record])
+        yield Still(f"frame {record.index}", session.load_image(record), record.exposure_s, own)
 
 
 def _seconds(row: list[str]) -> float | None:
@@ -119,8 +129,8 @@ def _seconds(row: list[str]) -> float | None:
     return seconds if 0.0 < seconds < 1e6 else None
 
 
-def _exif_light(data: bytes) -> float | None:
-    """Exposure time of a picture's Exif data, at ISO 100 and f/1 where it names these."""
+def _exif(data: bytes) -> dict[int, float]:
+    """Exposure time, f-number and sensitivity of a picture's Exif data, those that are there and positive."""
     found: dict[int, float] = {}
     try:
         for directory in read_directories(data):
@@ -128,9 +138,13 @@ def _exif_light(data: bytes) -> float | None:
                 if tag in directory:
                     found.setdefault(tag, directory.number(tag, np.nan))
     except ImageError:
+        return {}
+    return {tag: value for tag, value in found.items() if np.isfinite(value) and value > 0}
+
+
+def _light(found: dict[int, float]) -> float | None:
+    """Exposure time at ISO 100 and f/1, where the Exif data names these; None without a time."""
+    if _EXPOSURE_TIME not in found:
         return None
-    seconds = found.get(_EXPOSURE_TIME, 0.0)
-    light = (
-        seconds * found.get(_SENSITIVITY, 100.0) / 100.0 / found.get(_F_NUMBER, 1.0) ** 2 if seconds else 0.0
-    )
+    light = found[_EXPOSURE_TIME] * found.get(_SENSITIVITY, 100.0) / 100.0 / found.get(_F_NUMBER, 1.0) ** 2
     return light if np.isfinite(light) and light > 0 else None

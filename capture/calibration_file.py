@@ -3,8 +3,9 @@
     {"schema": "relight-calibration", "version": 1,
      "flash_offset_cam_m": {"value": [0.013, -0.007, 0.0], "unit": "m", "sigma": null, "source": "..."}, ...}
 
-What the entries mean is said in `calib.calibration`; capture needs only to write one and to read the
-response.
+What the entries mean is said in `calib.calibration`; capture needs only to write one, and to read those that
+make radiance of pixels (`capture.radiometry`). An entry may say under "made_with" which settings of the
+camera it holds for (`capture.controls`).
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from capture.atomic import atomic_write
+from capture.controls import MATTERING, Controls
 from capture.errors import CalibrationError
 from capture.json_fields import Fields, read_json
 
@@ -35,15 +37,24 @@ class Quantity:
         unit: e.g. "m", "px", "1" (dimensionless).
         sigma: standard deviation, of the shape of `value` or one number for all of it; None = not known.
         source: where it comes from: the procedure and its input, or the file that stated it.
+        made_with: settings of the camera that it holds for; None = not known, or none matter.
     """
 
     value: NDArray[np.float64]
     unit: str
     sigma: NDArray[np.float64] | None
     source: str
+    made_with: Controls | None = None
 
     @classmethod
-    def of(cls, value: ArrayLike, unit: str, source: str, sigma: ArrayLike | None = None) -> Quantity:
+    def of(
+        cls,
+        value: ArrayLike,
+        unit: str,
+        source: str,
+        sigma: ArrayLike | None = None,
+        made_with: Controls | None = None,
+    ) -> Quantity:
         """A quantity of anything that numpy takes as an array.
 
         Raises:
@@ -58,12 +69,15 @@ class Quantity:
                 raise ValueError(f"sigma has the shape {list(sigmas.shape)}, the value {list(values.shape)}")
             if not (np.isfinite(sigmas) & (sigmas >= 0)).all():
                 raise ValueError("sigma must be finite and not negative")
-        return cls(values, unit, sigmas, source)
+        return cls(values, unit, sigmas, source, made_with)
 
     def to_json(self) -> dict[str, Any]:
         """The entry of calibration.json."""
         sigma = None if self.sigma is None else self.sigma.tolist()
-        return {"value": self.value.tolist(), "unit": self.unit, "sigma": sigma, "source": self.source}
+        entry = {"value": self.value.tolist(), "unit": self.unit, "sigma": sigma, "source": self.source}
+        if self.made_with is not None and (settings := self.made_with.to_json()):
+            entry["made_with"] = settings
+        return entry
 
 
 def quantity_from_json(entry: Fields, unit: str, shape: tuple[int | None, ...]) -> Quantity:
@@ -85,9 +99,34 @@ def quantity_from_json(entry: Fields, unit: str, shape: tuple[int | None, ...]) 
     sigma_shape = value.shape if isinstance(raw, list) else ()
     sigma = entry.array("sigma", sigma_shape, None)
     try:
-        return Quantity.of(value, unit, entry.text("source", ""), sigma)
+        return Quantity.of(value, unit, entry.text("source", ""), sigma, made_with_of(entry))
     except ValueError as cause:
         raise entry.fail(f"{cause}.") from cause
+
+
+def made_with_of(entry: Fields) -> Controls | None:
+    """The settings that an entry holds for; None where it does not say."""
+    said = entry.child("made_with", None)
+    return None if said is None else Controls.from_json(said)
+
+
+def applicable_entries(entries: Fields, live: Controls) -> tuple[Fields, str | None]:
+    """The entries that hold for frames taken with the live settings, and a sentence on the others."""
+    kept, notes = dict(entries.values), []
+    for name, mattering in MATTERING.items():
+        entry = entries.child(name, None)
+        if entry is None:
+            continue
+        made_with = made_with_of(entry.child("pinhole") if name == "intrinsics" else entry)
+        differences = [] if made_with is None else made_with.differences(live, mattering)
+        if differences:
+            del kept[name]
+            notes.append(f"{name} ({', '.join(differences)})")
+    warning = (
+        f"Made with other settings and therefore not applied: {'; '.join(notes)}. Lock the camera as it was "
+        "calibrated, or calibrate it as it is locked."
+    )
+    return Fields(kept, entries.place, entries.error), warning if notes else None
 
 
 def read_calibration_entries(path: Path) -> Fields:

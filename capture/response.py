@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from capture.calibration_file import read_calibration_entries
+from capture.calibration_file import made_with_of, read_calibration_entries
+from capture.controls import Controls
 from capture.errors import TransferError
 from capture.json_fields import Fields
 from capture.transfer import canonical_transfer, to_linear
@@ -30,12 +31,14 @@ class Response:
         stored: [n] stored values 0..1, rising.
         linear: [n] or [n, 3] (R, G, B) radiance at these, never falling, 1.0 = white clip.
         source: where it comes from.
+        made_with: the camera that it holds for; None = not known.
     """
 
     transfer: str | None
     stored: NDArray[np.float64] | None = None
     linear: NDArray[np.float64] | None = None
     source: str = ""
+    made_with: Controls | None = None
 
     def __post_init__(self) -> None:
         """Checks the values.
@@ -84,10 +87,12 @@ class Response:
 
     def to_json(self) -> dict[str, Any]:
         """The entry of calibration.json."""
+        entry: dict[str, Any] = {"source": self.source}
+        if self.made_with is not None and (settings := self.made_with.to_json()):
+            entry["made_with"] = settings
         if self.stored is None or self.linear is None:
-            return {"transfer": self.transfer, "source": self.source}
-        table = {"stored": self.stored.tolist(), "linear": self.linear.tolist()}
-        return {"table": table, "source": self.source}
+            return {"transfer": self.transfer, **entry}
+        return {"table": {"stored": self.stored.tolist(), "linear": self.linear.tolist()}, **entry}
 
 
 def load_response(calibration: Path) -> Response | None:
@@ -107,11 +112,12 @@ def response_from_json(entry: Fields) -> Response:
     try:
         source = entry.text("source", "")
         if (table := entry.child("table", None)) is None:
-            return Response(canonical_transfer(entry.text("transfer")), source=source)
+            name = canonical_transfer(entry.text("transfer"))
+            return Response(name, source=source, made_with=made_with_of(entry))
         column = table.values.get("linear")
         wide = isinstance(column, list) and column and isinstance(column[0], list)
         linear = table.array("linear", (None, 3) if wide else (None,))
-        return Response(None, table.array("stored", (None,)), linear, source)
+        return Response(None, table.array("stored", (None,)), linear, source, made_with_of(entry))
     except TransferError as cause:
         raise entry.fail(str(cause)) from cause
     except ValueError as cause:

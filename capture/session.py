@@ -27,14 +27,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capture.atomic import atomic_write
+from capture.calibration_file import applicable_entries, read_calibration_entries
 from capture.cameras import Camera
 from capture.colmap_model import read_colmap_model, write_colmap_model
-from capture.errors import ImageError, SessionError
+from capture.controls import Controls, controls_of_session
+from capture.errors import CalibrationError, ImageError, SessionError
 from capture.frame_log import FrameLog
 from capture.frame_record import EXCLUDING_REASONS as EXCLUDING_REASONS
 from capture.frame_record import FrameRecord as FrameRecord
 from capture.images import read_image, write_image
-from capture.response import Response, load_response
+from capture.json_fields import Fields
+from capture.radiometry import Radiometry, radiometry_of
 from capture.session_manifest import RESERVED_KEYS, ROTATIONS_DEG, STATUSES, read_manifest, write_manifest
 from capture.transfer import canonical_transfer
 
@@ -66,7 +69,8 @@ class Session:
         self._by_index: dict[int, FrameRecord] = {}
         self._by_file: dict[str, FrameRecord] = {}
         self._log = FrameLog(path / "frames.jsonl")
-        self._response: Response | None = None
+        self._radiometry: Radiometry | None = None
+        self._calibration_said = False
 
     @classmethod
     def create(
@@ -256,19 +260,48 @@ class Session:
         return image
 
     def load_radiance(self, record: FrameRecord) -> NDArray[np.float32]:
-        """A frame in linear radiance: [H, W, 3], 1.0 = white clip.
+        """A frame in linear radiance: [H, W, 3], 1.0 = white clip in the middle of the picture.
 
-        Integer pixels go through the response of calibration.json where there is one, else through the
-        session's transfer function. Float pixels (EXR, HDR) are radiance already.
+        Dark level, response, flat field and colour of calibration.json are applied where they are there and
+        were made with the settings of this session; else the session's transfer function is all.
+        Float pixels (EXR, HDR) have neither dark level nor response.
         """
-        image = self.load_image(record)
-        if image.ndim == 2:
-            image = np.repeat(image[..., None], 3, axis=2)
-        if image.dtype == np.float32:
-            return image
-        if self._response is None:
-            self._response = load_response(self.calibration_path) or Response(self.info["image"]["transfer"])
-        return self._response.to_linear(image)
+        return self.radiometry.radiance(self.load_exposure(record))
+
+    def load_exposure(self, record: FrameRecord) -> NDArray[np.float32]:
+        """A frame as the sensor was exposed, linear: [H, W, 3], 1.0 = white clip; for clipping and noise."""
+        return self.radiometry.exposure(self.load_image(record))
+
+    @property
+    def radiometry(self) -> Radiometry:
+        """What makes radiance of this session's pixels."""
+        if self._radiometry is None:
+            entries, _ = self.read_calibration()
+            self._radiometry = radiometry_of(entries, self.info["image"]["transfer"])
+        return self._radiometry
+
+    @property
+    def controls(self) -> Controls:
+        """What the camera was set to, as far as the session tells."""
+        return controls_of_session(self.info, self.frames)
+
+    def read_calibration(self) -> tuple[Fields, str | None]:
+        """The entries of calibration.json that hold for this session; none where there is no file.
+
+        Returns:
+            The entries, and a sentence on those that were made with other settings and are not applied. It
+            is logged the first time.
+
+        Raises:
+            CalibrationError: malformed.
+        """
+        if not self.calibration_path.is_file():
+            return Fields({}, str(self.calibration_path), CalibrationError), None
+        entries, warning = applicable_entries(read_calibration_entries(self.calibration_path), self.controls)
+        if warning is not None and not self._calibration_said:
+            logger.warning("%s: %s", self.calibration_path, warning)
+            self._calibration_said = True
+        return entries, warning
 
     def load_mask(self, record: FrameRecord) -> NDArray[np.uint8] | None:
         """The subject's coverage in a frame: [H, W] 0..255; None where there is no mask."""

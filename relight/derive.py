@@ -21,7 +21,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from calib.calibration import load_calibration
+from calib.calibration import session_calibration
 from capture.cameras import Camera
 from capture.frame_record import FrameRecord
 from capture.ply import PointCloud, read_ply, write_ply
@@ -215,7 +215,7 @@ def _scale_of(session: Session, cameras: Mapping[int, Camera], progress: Progres
     points, normals = cloud.points[some], cloud.normals[some]
     spacing, _ = spacing_and_noise(points)
     flash = flash_samples(scene, points, normals, spacing, progress)
-    offset = load_calibration(session.calibration_path).flash_offset_cam_m
+    offset = session_calibration(session).flash_offset_cam_m
     # What the flash says is known of a few of the points; a nose needs all of them.
     _, nearest = cKDTree(flash.points).query(points, workers=-1)
     return find_scale(

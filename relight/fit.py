@@ -170,7 +170,12 @@ def fit(
     metrics |= {
         "check": asdict(check),
         "geometry": cache.reports(),
-        "warnings": [*cache.warnings(), *warnings, *portrait.info.get("warnings", ())],
+        "warnings": [
+            *scene.calibration_warnings,
+            *cache.warnings(),
+            *warnings,
+            *portrait.info.get("warnings", ()),
+        ],
     }
     _write_json(folder / "metrics.json", metrics)
     # Last, because its key says that all of the portrait is there.

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 
 from capture.cameras import Camera
@@ -30,6 +31,9 @@ class Observations:
         flash: [K] bool.
         flash_position_world: [K, 3].
         view_direction_world: [K, 3], unit, from the middle of the points to the camera.
+        flash_axis_world: [K, 3] unit, where the flash is strongest.
+        flash_falloff: mu of cos(angle to the axis)^mu.
+        variance: [K, P] float32, of the noise of the channels' mean; None = no noise model is known.
         outside: [P] float32, share of the frames with a mask, of those that have the point in the picture,
             in which it lies outside the mask: what is off the subject in a frame is not the subject,
             whether seen or hidden.
@@ -41,6 +45,9 @@ class Observations:
     flash_position_world: torch.Tensor
     view_direction_world: torch.Tensor
     outside: torch.Tensor
+    flash_axis_world: torch.Tensor
+    flash_falloff: float = 0.0
+    variance: torch.Tensor | None = None
 
 
 def observe_points(scene: Scene, surface: SurfaceCloud, progress: Progress = no_progress) -> Observations:
@@ -50,6 +57,7 @@ def observe_points(scene: Scene, surface: SurfaceCloud, progress: Progress = no_
     count, total = len(scene.views), len(points)
     radiance = points.new_zeros(count, total, 3)
     cosine = points.new_zeros(count, total)
+    variance: torch.Tensor | None = None
     off, in_picture = points.new_zeros(total), points.new_zeros(total)
     for k, view in enumerate(scene.views):
         observation = scene.observe(view)
@@ -59,24 +67,32 @@ def observe_points(scene: Scene, surface: SurfaceCloud, progress: Progress = no_
         layers = [measured.permute(2, 0, 1), observation.valid[None]]
         if observation.mask is not None:
             layers.append(_eroded(observation.mask)[None])
+        trusted_until = len(layers) + 2
+        if observation.variance is not None:
+            layers.append(observation.variance[None])
+            variance = cosine.new_zeros(count, total) if variance is None else variance
         seen = (slant > _GRAZING).nonzero()[:, 0]
         samples = sample_bilinear(torch.cat(layers), uv_px[seen])
         # A clipped or masked neighbour in the bilinear sum already makes it wrong.
-        trusted = (samples[:, 3:] > 0.999).all(dim=1)
+        trusted = (samples[:, 3:trusted_until] > 0.999).all(dim=1)
         radiance[k, seen] = torch.where(trusted[:, None], samples[:, :3], 0.0)
         cosine[k, seen] = torch.where(trusted, slant[seen], 0.0)
+        if variance is not None:
+            variance[k, seen] = samples[:, -1]
         if observation.mask is not None:
             coverage = sample_bilinear(_dilated(observation.mask)[None], uv_px)[:, 0]
             off += inside & (coverage < 0.5)
             in_picture += inside
         progress("observe", (k + 1) / count)
-    offset = torch.as_tensor(scene.flash_offset_cam_m, dtype=torch.float64)
+    poses = [view.camera.cam_from_world for view in scene.views]
+    offset = np.asarray(scene.flash_offset_cam_m, np.float64)
     flash_positions = torch.stack(
         [
-            torch.from_numpy(view.camera.centre_world + view.camera.cam_from_world[:3, :3].T @ offset.numpy())
+            torch.from_numpy(view.camera.centre_world + view.camera.cam_from_world[:3, :3].T @ offset)
             for view in scene.views
         ]
     )
+    axes = torch.stack([torch.from_numpy(scene.lamp.axis_world(pose)) for pose in poses])
     centres = torch.stack([torch.as_tensor(view.camera.centre_world) for view in scene.views]).to(points)
     return Observations(
         radiance=radiance,
@@ -85,6 +101,9 @@ def observe_points(scene: Scene, surface: SurfaceCloud, progress: Progress = no_
         flash_position_world=flash_positions.to(points),
         view_direction_world=torch.nn.functional.normalize(centres - points.mean(dim=0), dim=1),
         outside=off / in_picture.clamp(min=1.0),
+        flash_axis_world=axes.to(points),
+        flash_falloff=scene.lamp.falloff,
+        variance=variance,
     )
 
 

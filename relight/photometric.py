@@ -21,14 +21,17 @@ no-flash frame a point shows its room radiance; a flash frame adds
 Robust: frames in which gloss, a shadow, a wrong visibility or a moved pose spoils a point lose weight by a
 Cauchy function of their residual. Clipped pixels never had any.
 
-Units: radiance 1.0 = white clip. Only albedo * C is observable, so a scale has to be chosen: the brightest
-twentieth of the points that the flash saw has albedo `ALBEDO_95` (mean of the channels), and the flash is
-taken for white.
+A calibrated flash (`relight.lamp`) brings its beam, its strength and its colour; with a noise model frames
+count for less where noise is not small against what the model itself leaves.
+
+Units: radiance 1.0 = white clip. Only albedo * C is observable. With the flash's strength known the albedo is
+absolute; else a scale has to be chosen: the brightest twentieth of the points that the flash saw has albedo
+`ALBEDO_95` (mean of the channels), and the flash is taken for white.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -38,6 +41,7 @@ from scipy.spatial import cKDTree
 from relight.cloud import CloudConfig, prepare_cloud
 from relight.errors import PlanError
 from relight.infill import infill
+from relight.lamp import Lamp, beam
 from relight.mirror_infill import mirror_infill
 from relight.observations import Observations, observe_points
 from relight.portrait import Portrait
@@ -64,6 +68,8 @@ _MIRROR_WORTH = 0.03  # of the points that no flash reached, from which on a fac
 _OUTSIDE_LIMIT = (
     0.05  # share of the frames that may show a point off the subject: masks and poses err by a pixel
 )
+_MODEL_ERROR = 0.06  # of what the flash adds: gloss, poses and normals leave about so much
+_ALBEDO_95_LIMITS = (0.1, 1.3)  # of a subject under a flash whose strength is right
 _ITERATIONS = 4
 _GAIN_STEPS = 8  # a step carries gains to the frames that see the same points; a lamp droops over all of them
 
@@ -153,7 +159,8 @@ def solve(scene: Scene, config: SolveConfig = SolveConfig(), progress: Progress 
         )
 
     room, room_information = _room_radiance(observations)
-    flash = _flash_part(observations, points, room, room_information)
+    tint, level = _strength(scene.lamp)
+    flash = _flash_part(observations, points, room, room_information, points.new_tensor(tint))
     scale, reflectance, gains = _global_quantities(flash, prior, config)
     lamps = observations.flash_position_world[observations.flash]
     if scale < _FLOOR * float(((lamps - points.mean(dim=0)) ** 2).sum(dim=1).median()):
@@ -187,7 +194,7 @@ def solve(scene: Scene, config: SolveConfig = SolveConfig(), progress: Progress 
         from_mirror = float(mirrored.filled.float().mean())
     albedo = infill(points, filled, worth, known=config.known, nearest=surface.spacing)
     room = infill(points, room, room_information, known=0.3, nearest=surface.spacing)
-    gauge = ALBEDO_95 / float(torch.quantile(_sampled(albedo[known].mean(dim=1)), 0.95).clamp(min=1e-6))
+    gauge, warnings = _gauge(albedo[known].mean(dim=1), scale, level)
     albedo = (albedo * gauge).clamp(min=0.0)
     c_room, shading = _split_room(room, albedo, information > config.known)
     normal_sigma = _normal_sigma(information, relative, config.normal_sigma_rad)
@@ -208,7 +215,7 @@ def solve(scene: Scene, config: SolveConfig = SolveConfig(), progress: Progress 
         residual=residual,
         spacing=surface.spacing,
         c_room=_three(c_room),
-        c_flash=(scale / gauge,) * 3,
+        c_flash=_three([scale / gauge * share for share in tint]),
         flash_offset_cam_m=_three(torch.as_tensor(scene.flash_offset_cam_m)),
         reflectance=Reflectance(reflectance.retro, reflectance.alpha, reflectance.f0 * gauge),
         info={
@@ -220,6 +227,8 @@ def solve(scene: Scene, config: SolveConfig = SolveConfig(), progress: Progress 
             "cloud_noise": surface.noise,
             "known_share": round(float(known.float().mean()), 4),
             "mirrored_share": round(from_mirror, 4),
+            "absolute_albedo": level is not None and not warnings,
+            "warnings": warnings,
         },
     )
     return portrait if bool(on_subject.all()) else portrait.subset(on_subject)
@@ -244,10 +253,36 @@ def _room_radiance(observations: Observations) -> tuple[torch.Tensor, torch.Tens
     return torch.cat(rooms), torch.cat(informations)
 
 
+def _strength(lamp: Lamp) -> tuple[list[float], float | None]:
+    """Colour of the flash [3], its mean 1, and its strength; white and None where these are not known."""
+    if lamp.strength is None:
+        return [1.0, 1.0, 1.0], None
+    level = float(lamp.strength.mean())
+    return (lamp.strength / level).tolist(), level
+
+
+def _gauge(albedo: torch.Tensor, scale: float, level: float | None) -> tuple[float, list[str]]:
+    """Factor from solved albedos [P] (mean of the channels) to albedo, and a sentence where the flash's
+    strength cannot be right."""
+    top = float(torch.quantile(_sampled(albedo), 0.95).clamp(min=1e-6))
+    low, high = _ALBEDO_95_LIMITS
+    if level is None or low <= top * scale / level <= high:
+        return (ALBEDO_95 / top if level is None else scale / level), []
+    return ALBEDO_95 / top, [
+        "With the calibrated strength of the flash the subject's albedo would reach "
+        f"{top * scale / level:.2g}: the flash is not the one that was calibrated, or not at its level. The "
+        "albedo's scale is a convention as without it."
+    ]
+
+
 def _flash_part(
-    observations: Observations, points: torch.Tensor, room: torch.Tensor, room_information: torch.Tensor
+    observations: Observations,
+    points: torch.Tensor,
+    room: torch.Tensor,
+    room_information: torch.Tensor,
+    tint: torch.Tensor,
 ) -> _Flash:
-    """Flash-added radiance times d^2, without the flash's scale, and where it comes from.
+    """Flash-added radiance times d^2, as of a white flash without beam and scale, and where it comes from.
 
     What the room alone would have shown in a flash frame is taken from the no-flash frames beside it: the
     room's gloss on the subject moves with the camera, and the mean over all views would not know.
@@ -256,7 +291,7 @@ def _flash_part(
     weight = (observations.cosine[lit] > 0).float() * (room_information > 0.5)
     response, to_light = (points.new_empty(len(weight), len(points), 3) for _ in range(2))
     nearness = _nearness(observations.view_direction_world[lit], observations.view_direction_world[dark])
-    positions = observations.flash_position_world[lit]
+    positions, axes = observations.flash_position_world[lit], observations.flash_axis_world[lit]
     for part in _chunks(len(points)):
         share = observations.cosine[dark, part]
         luminance, mean = observations.radiance[dark, part].mean(dim=-1), room[part].mean(dim=-1)
@@ -269,8 +304,29 @@ def _flash_part(
         square = (towards * towards).sum(dim=-1, keepdim=True)
         to_light[:, part] = towards / square.sqrt().clamp(min=1e-12)
         added = observations.radiance[lit, part] - beside
-        response[:, part] = added * square * weight[:, part, None]
+        whole = square / tint
+        if observations.flash_falloff > 0:
+            share = beam(to_light[:, part], axes[:, None], observations.flash_falloff)
+            whole = whole / share[..., None]
+        response[:, part] = added * whole * weight[:, part, None]
+        if observations.variance is not None:
+            variance = observations.variance[dark, part].mean(dim=0) / total[..., 0]
+            variance = (observations.variance[lit, part] + variance) * whole.mean(dim=-1) ** 2
+            weight[:, part] *= _noise_weight(response[:, part].mean(dim=-1), variance, weight[:, part])
     return _Flash(response, weight, to_light, points.new_ones(len(points)))
+
+
+def _noise_weight(response: torch.Tensor, variance: torch.Tensor, seen: torch.Tensor) -> torch.Tensor:
+    """Weight [K, P] of responses whose noise has a variance [K, P], against the others of their point.
+
+    What the model itself leaves counts as noise too, relative to the point's mean over its frames: relative
+    to the single observation, noise that makes it brighter would also make it count for more. The mean weight
+    of a point is 1: how well it is known is told by its residual.
+    """
+    mean = (response * seen).sum(dim=0) / seen.sum(dim=0).clamp(min=1.0)
+    model = (_MODEL_ERROR * mean.clamp(min=0.0)) ** 2 + 1e-12
+    weight = model / (model + variance)
+    return weight * seen.sum(dim=0).clamp(min=1.0) / (weight * seen).sum(dim=0).clamp(min=1e-12)
 
 
 def _nearness(of: torch.Tensor, others: torch.Tensor) -> torch.Tensor:
@@ -467,6 +523,6 @@ def _sampled(values: torch.Tensor) -> torch.Tensor:
     return values[:: max(1, len(values) // 1_000_000)]
 
 
-def _three(values: torch.Tensor) -> tuple[float, float, float]:
+def _three(values: Iterable[float | torch.Tensor]) -> tuple[float, float, float]:
     x, y, z = (float(value) for value in values)
     return x, y, z

@@ -13,12 +13,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from calib.calibration import load_calibration
+from calib.calibration import Calibration, session_calibration
 from capture.cameras import Camera
 from capture.frame_record import FrameRecord
 from capture.ply import read_ply
+from capture.radiometry import Radiometry
 from capture.session import Session
 from relight.errors import PlanError
+from relight.lamp import Lamp, lamp_of
 from relight.stages import Progress, no_progress
 
 CLIPPED_RADIANCE = 0.95
@@ -51,11 +53,35 @@ class Observation:
         valid: [H, W] float32, 1 where the pixel can be trusted, 0 where it is clipped, not finite or
             outside the lens.
         mask: [H, W] float32 0..1 coverage of the subject, None = not given.
+        variance: [H, W] float32, of the noise of the channels' mean; None = no noise model is known.
     """
 
     radiance: torch.Tensor
     valid: torch.Tensor
     mask: torch.Tensor | None
+    variance: torch.Tensor | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseModel:
+    """The noise of a pixel: variance = read^2 + shot * exposure, by channel.
+
+    Attributes:
+        read: [3] standard deviation at black.
+        shot: [3].
+    """
+
+    read: NDArray[np.float64]
+    shot: NDArray[np.float64]
+
+    def variance(self, exposure: NDArray[np.float32], radiometry: Radiometry) -> NDArray[np.float32]:
+        """[H, W] of the mean of the channels of the radiance that an exposure [H, W, 3] becomes."""
+        share = np.full(3, 1.0 / 3.0) if radiometry.colour is None else radiometry.colour.mean(axis=0)
+        weights = (share**2 * self.shot).astype(np.float32)
+        variance = np.maximum(exposure, 0.0) @ weights + np.float32((share**2) @ self.read**2)
+        if radiometry.flat_field is not None:
+            variance = variance / radiometry.passed(*variance.shape) ** 2
+        return np.asarray(variance, np.float32)
 
 
 class Scene:
@@ -67,8 +93,11 @@ class Scene:
         views: The frames to fit.
         flash_offset_cam_m: [3] lens to flash in camera axes; zero when unknown (the paper's co-located
             flash).
+        lamp: How the flash shines, as far as it is known.
         device: Where the solve runs.
     """
+
+    lamp: Lamp = Lamp()
 
     def __init__(
         self,
@@ -80,6 +109,8 @@ class Scene:
         device: torch.device,
         records: dict[int, FrameRecord],
         distorted: dict[int, Camera],
+        lamp: Lamp,
+        noise: NoiseModel | None,
     ) -> None:
         """For `load_scene` only."""
         self.points = points
@@ -90,6 +121,14 @@ class Scene:
         self._session = session
         self._records = records
         self._distorted = distorted
+        self.lamp = lamp
+        self._noise = noise
+
+    @property
+    def calibration_warnings(self) -> list[str]:
+        """What of the calibration is not applied, and why: one sentence or none."""
+        _, warning = self._session.read_calibration()
+        return [] if warning is None else [warning]
 
     @property
     def rotation_deg(self) -> int:
@@ -99,12 +138,17 @@ class Scene:
     def observe(self, view: View) -> Observation:
         """Reads, linearises and undistorts a frame and its mask."""
         record = self._records[view.index]
-        radiance = self._session.load_radiance(record)
+        radiometry = self._session.radiometry
+        exposure = self._session.load_exposure(record)
         keeps_highlights = str(record.file).endswith(_FLOAT_SUFFIXES)
-        limit = self._float_limit() if keeps_highlights else CLIPPED_RADIANCE
+        limits = CLIPPED_RADIANCE * radiometry.white
+        if keeps_highlights:
+            limits = np.full(3, self._float_limit(), np.float32)
         # By channel: a maximum over the last axis takes several times as long. NaN fails every comparison.
-        good = [np.abs(radiance[..., channel]) < limit for channel in range(3)]
+        good = [np.abs(exposure[..., channel]) < limits[channel] for channel in range(3)]
         valid = (good[0] & good[1] & good[2]).astype(np.float32)
+        radiance = radiometry.radiance(exposure)
+        variance = None if self._noise is None else self._noise.variance(exposure, radiometry)
         if keeps_highlights:
             radiance = np.where(np.isfinite(radiance), radiance, np.float32(0.0))
         coverage = self._session.load_mask(record)
@@ -113,10 +157,12 @@ class Scene:
             grid = _undistortion_grid(self._distorted[view.index], view.camera)
             radiance, valid = _remapped(radiance, grid), _remapped(valid, grid)
             mask = None if mask is None else _remapped(mask, grid)
+            variance = None if variance is None else _remapped(variance, grid)
         return Observation(
             torch.from_numpy(radiance).to(self.device),
             torch.from_numpy(valid).to(self.device),
             None if mask is None else torch.from_numpy(mask).to(self.device),
+            None if variance is None else torch.from_numpy(variance).to(self.device),
         )
 
     def _float_limit(self) -> float:
@@ -165,18 +211,28 @@ def load_scene(
         normals = torch.from_numpy(np.ascontiguousarray(cloud.normals, dtype=np.float32))
     if not len(points):
         raise PlanError(f"The cloud {session.points_path} has no points; a fit needs one.")
-    offset = load_calibration(session.calibration_path).value("flash_offset_cam_m")
+    calibration = session_calibration(session)
+    offset = calibration.value("flash_offset_cam_m")
+    assert offset is not None  # it has a fallback
     progress("read", 1.0)
     return Scene(
         session,
         points,
         normals,
         tuple(views),
-        np.zeros(3) if offset is None else offset,
+        offset,
         device,
         {view.index: records[view.index] for view in views},
         distorted,
+        lamp_of(calibration),
+        noise_model_of(calibration),
     )
+
+
+def noise_model_of(calibration: Calibration) -> NoiseModel | None:
+    """The noise model of a calibration, where it has one."""
+    read, shot = calibration.value("noise_read"), calibration.value("noise_shot")
+    return None if read is None or shot is None else NoiseModel(read, shot)
 
 
 def _undistortion_grid(

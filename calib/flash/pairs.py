@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from calib.calibration import Calibration
 from calib.errors import FlashGeometryError
+from capture.controls import UNKNOWN, Controls
 from capture.errors import SourceError
 from capture.frame_record import FrameRecord
 from capture.images import IMAGE_SUFFIXES, read_image
@@ -67,6 +68,7 @@ class PairSource:
         transfer: what the pictures were linearised by, for people.
         pairs: reads them one at a time, in order of time.
         left_out: what could not be paired, one clause each.
+        controls: settings of the camera, as far as they are known.
     """
 
     count: int
@@ -74,6 +76,7 @@ class PairSource:
     transfer: str
     pairs: Callable[[], Iterator[FlashPair]]
     left_out: list[str]
+    controls: Controls = UNKNOWN
 
 
 def open_pairs(source: Path, calibration: Calibration, transfer: str = "srgb") -> PairSource:
@@ -149,7 +152,7 @@ def _session_pairs(path: Path, calibration: Calibration) -> PairSource:
     timed = all(record.pts_s is not None for record, _ in pairs)
 
     def picture(record: FrameRecord) -> LinearPicture:
-        return _linear(f"frame {record.index}", session.load_image(record), response, dark, limit)
+        return linear_picture(f"frame {record.index}", session.load_image(record), response, dark, limit)
 
     def read() -> Iterator[FlashPair]:
         for number, (with_flash, without) in enumerate(pairs):
@@ -157,7 +160,8 @@ def _session_pairs(path: Path, calibration: Calibration) -> PairSource:
             yield FlashPair(picture(with_flash), picture(without), at_s)
 
     lost = [f"{alone} pulses have no unlit frame that is near in time and equally exposed"] if alone else []
-    return PairSource(len(pairs), timed, response.transfer or "the measured response", read, lost)
+    by = response.transfer or "the measured response"
+    return PairSource(len(pairs), timed, by, read, lost, session.controls)
 
 
 def _folder_pairs(folder: Path, calibration: Calibration, transfer: str) -> PairSource:
@@ -173,7 +177,7 @@ def _folder_pairs(folder: Path, calibration: Calibration, transfer: str) -> Pair
     dark = calibration.value("dark")
 
     def picture(path: Path) -> LinearPicture:
-        return _linear(path.name, read_image(path), response, dark, np.inf)
+        return linear_picture(path.name, read_image(path), response, dark, np.inf)
 
     def read() -> Iterator[FlashPair]:
         for number, name in enumerate(names):
@@ -197,9 +201,18 @@ def _named(folder: Path, kind: str) -> dict[str, Path]:
     return found
 
 
-def _linear(
+def linear_picture(
     name: str, image: NDArray[Any], response: Response, dark: NDArray[np.float64] | None, limit: float
 ) -> LinearPicture:
+    """A picture in linear light.
+
+    Args:
+        name: for people.
+        image: as stored.
+        response: stored value above the dark level -> radiance; float pictures are radiance already.
+        dark: [3] stored dark level; None = 0.
+        limit: of float pictures, from which on they are clipped.
+    """
     stored: NDArray[Any] = image if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2)
     clipped: NDArray[np.bool_]
     if stored.dtype == np.float32:

@@ -19,17 +19,19 @@ from calib.flash.geometry import FlashGeometry, poses_of
 from calib.flash.model import FALLOFF, LIGHT_NAMES
 from capture.atomic import atomic_write
 from capture.calibration_file import write_calibration_entries
+from capture.controls import UNKNOWN, Controls
 
 _SCHEMA, _SCHEMA_VERSION = "relight-flash-evidence", 1
 
 
-def flash_of(found: FlashGeometry, board: Board, source: str) -> Calibration:
+def flash_of(found: FlashGeometry, board: Board, source: str, controls: Controls = UNKNOWN) -> Calibration:
     """The entries of calibration.json; the axis is missing where it could not be told.
 
     Args:
         found: the calibration.
         board: that was lit.
         source: what was filmed, for the provenance.
+        controls: settings of the camera; the strength holds for these.
     """
     about = (
         f"{source}; {board.describe()}; {len(found.boards)} boards in {poses_of(found)} poses, boards left "
@@ -48,7 +50,13 @@ def flash_of(found: FlashGeometry, board: Board, source: str) -> Calibration:
         flash_falloff=Quantity.of(
             fit.light.vector[FALLOFF], "1", about, np.sqrt(fit.covariance[FALLOFF, FALLOFF])
         ),
-        flash_strength=Quantity.of(found.strength, "m^2", strength, _deviations(found.strength_covariance)),
+        flash_strength=Quantity.of(
+            found.strength,
+            "m^2",
+            strength,
+            _deviations(found.strength_covariance),
+            controls.mattering("flash_strength"),
+        ),
     )
 
 
@@ -57,7 +65,9 @@ def flash_evidence_path(calibration: Path) -> Path:
     return calibration.with_suffix(".flash.json")
 
 
-def save_flash(found: FlashGeometry, board: Board, path: Path, source: str) -> None:
+def save_flash(
+    found: FlashGeometry, board: Board, path: Path, source: str, controls: Controls = UNKNOWN
+) -> None:
     """Sets the flash's entries of a calibration.json, whose others stay, and writes the evidence beside it.
 
     An axis that was known before and is not told now is taken out: it does not go with the new falloff.
@@ -65,7 +75,7 @@ def save_flash(found: FlashGeometry, board: Board, path: Path, source: str) -> N
     Raises:
         CalibrationError: the file is there but malformed.
     """
-    save_calibration(flash_of(found, board, source), path)
+    save_calibration(flash_of(found, board, source, controls), path)
     if not found.axis_known:
         write_calibration_entries(path, {"flash_axis": None})
     content = json.dumps(flash_evidence(found, board, source), allow_nan=False)

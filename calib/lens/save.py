@@ -19,11 +19,12 @@ from calib.lens.intrinsics import IntrinsicsResult
 from calib.lens.terms import LENS_MODELS, LENS_NAMES
 from calib.lens.uncertainty import pixel_grid, projection_sigma
 from capture.atomic import atomic_write
+from capture.controls import UNKNOWN, Controls
 
 _SCHEMA, _SCHEMA_VERSION = "relight-intrinsics-evidence", 1
 
 
-def intrinsics_of(result: IntrinsicsResult, source: str) -> Intrinsics:
+def intrinsics_of(result: IntrinsicsResult, source: str, controls: Controls = UNKNOWN) -> Intrinsics:
     """The entry of calibration.json.
 
     Terms that the model does not have are zero; so is their standard deviation, unless they are in doubt.
@@ -31,6 +32,7 @@ def intrinsics_of(result: IntrinsicsResult, source: str) -> Intrinsics:
     Args:
         result: the calibration.
         source: what was filmed, for the provenance.
+        controls: settings of the camera; a lens holds for its focus.
     """
     about = (
         f"{source}; {result.board.describe()}; {len(result.views)} views, model {result.model}, corner noise "
@@ -42,7 +44,7 @@ def intrinsics_of(result: IntrinsicsResult, source: str) -> Intrinsics:
     return Intrinsics(
         width,
         height,
-        Quantity.of(result.lens[:4], "px", about, sigma[:4]),
+        Quantity.of(result.lens[:4], "px", about, sigma[:4], controls.mattering("intrinsics")),
         Quantity.of(result.lens[4 : 4 + terms], "1", about, sigma[4 : 4 + terms]) if terms else None,
     )
 
@@ -52,13 +54,15 @@ def evidence_path(calibration: Path) -> Path:
     return calibration.with_suffix(".intrinsics.json")
 
 
-def save_intrinsics(result: IntrinsicsResult, path: Path, source: str, distance_m: float) -> None:
+def save_intrinsics(
+    result: IntrinsicsResult, path: Path, source: str, distance_m: float, controls: Controls = UNKNOWN
+) -> None:
     """Sets the intrinsics of a calibration.json, whose other entries stay, and writes the evidence beside it.
 
     Raises:
         CalibrationError: the file is there but malformed.
     """
-    save_calibration(Calibration(intrinsics=intrinsics_of(result, source)), path)
+    save_calibration(Calibration(intrinsics=intrinsics_of(result, source, controls)), path)
     content = json.dumps(evidence_of(result, source, distance_m), allow_nan=False)
     atomic_write(evidence_path(path), content.encode() + b"\n")
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from calib.calibration import load_calibration
+from calib.calibration import session_calibration
 from capture.frame_record import FrameRecord
 from capture.session import Session
 from relight.errors import GeometryError
@@ -139,7 +139,7 @@ def _ladder(config: SfmConfig) -> list[Way]:
 
 def _lenses(session: Session, records: Sequence[FrameRecord]) -> dict[tuple[int, int], Lens]:
     """What is known of the lens, by the frames' size."""
-    calibrated = load_calibration(session.calibration_path).intrinsics
+    calibrated = session_calibration(session).intrinsics
     lenses: dict[tuple[int, int], Lens] = {}
     for record in records:
         size = (record.width, record.height)

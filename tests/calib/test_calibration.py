@@ -25,6 +25,7 @@ def everything():
         noise_shot=Quantity.of([2e-4] * 3, "1", "sweep"),
         flat_field=Quantity.of([-0.3, 0.02], "1", "white wall"),
         colour=Quantity.of(np.eye(3) * 1.1, "1", "chart"),
+        room_white=Quantity.of([1.2, 1.0, 0.8], "1", "chart"),
         flash_offset_cam_m=Quantity.of([0.013, -0.007, 0.0], "m", "ruler", [0.001] * 3),
         flash_axis=Quantity.of([0.0, 0.6, 0.8], "1", "wall"),
         flash_falloff=Quantity.of(1.5, "1", "wall"),
@@ -65,7 +66,7 @@ def test_nothing_known_is_a_calibration_that_says_what_it_assumes(tmp_path):
     assert np.array_equal(found.value("colour"), np.eye(3))
     assert found.value("flash_strength") is None
     sentences = found.assumptions()
-    assert len(sentences) == len(set(sentences)) == 10
+    assert len(sentences) == len(set(sentences)) == 11
     assert any("at the lens" in sentence for sentence in sentences)
 
 

@@ -20,10 +20,13 @@ from capture.calibration_file import Quantity
 from capture.cameras import Camera
 from capture.images import write_png
 from capture.ply import PointCloud, write_ply
+from capture.radiometry import Radiometry
+from capture.response import Response
 from capture.session import FrameRecord, Session
+from relight.lamp import Lamp
 from relight.portrait import Portrait
 from relight.reflectance import Reflectance
-from relight.scene import Observation, View
+from relight.scene import NoiseModel, Observation, View
 
 AXES_M = np.array([0.085, 0.115, 0.100])
 FLASH_OFFSET_CAM_M = np.array([0.015, -0.01, 0.0])
@@ -263,6 +266,8 @@ class MemoryScene:
     normals_world: torch.Tensor | None = None
     with_masks: bool = True
     flash_offset_cam_m: np.ndarray = field(default_factory=lambda: FLASH_OFFSET_CAM_M.copy())
+    lamp: Lamp = field(default_factory=Lamp)
+    noise: NoiseModel | None = None
     device: torch.device = field(default_factory=lambda: torch.device("cpu"))
     clip: float = 0.95
     rotation_deg: int = 0
@@ -277,7 +282,11 @@ class MemoryScene:
         radiance = torch.from_numpy(np.asarray(self.radiances[view.index], np.float32))
         valid = (radiance.amax(dim=-1) < self.clip).float()
         mask = torch.from_numpy(self.frames[view.index].hit.astype(np.float32)) if self.with_masks else None
-        return Observation(radiance, valid, mask)
+        variance = None
+        if self.noise is not None:
+            exposure = np.asarray(self.radiances[view.index], np.float32)
+            variance = torch.from_numpy(self.noise.variance(exposure, Radiometry(Response("linear"))))
+        return Observation(radiance, valid, mask, variance)
 
 
 def write_session(path: Path, frames: Sequence[Frame], cloud: PointCloud, *, transfer="srgb") -> Session:

@@ -39,6 +39,7 @@ def run(args: argparse.Namespace) -> None:
     from calib.errors import NoiseError
     from calib.sensor.noise import fit_dark, fit_noise
     from calib.stills import read_stills
+    from capture.controls import common_controls
 
     if not args.source and not args.flats:
         raise NoiseError("Give pictures with the lens covered, or --flats, or both.")
@@ -51,20 +52,21 @@ def run(args: argparse.Namespace) -> None:
     found = Calibration()
     if dark is not None:
         about = f"{dark.frames} dark pictures of {', '.join(path.name for path in args.source)}"
-        found = Calibration(dark=Quantity.of(dark.level, "1", about, dark.sigma))
+        made_with = common_controls(still.controls for still in darks).mattering("dark")
+        found = Calibration(dark=Quantity.of(dark.level, "1", about, dark.sigma, made_with))
         print(_describe_dark(dark))
     if args.flats:
-        noise = fit_noise(
-            list(read_stills(args.flats)), response, level, darks if dark is not None and not dark.cut else ()
-        )
+        flats = list(read_stills(args.flats))
+        noise = fit_noise(flats, response, level, darks if dark is not None and not dark.cut else ())
+        made_with = common_controls(still.controls for still in flats).mattering("noise_read")
         about = (
             f"photon transfer of {noise.pairs} pairs of {', '.join(path.name for path in args.flats)}, "
             f"linearised by {named}"
         )
         found = Calibration(
             dark=found.dark,
-            noise_read=Quantity.of(noise.read, "1", about, noise.read_sigma),
-            noise_shot=Quantity.of(noise.shot, "1", about, noise.shot_sigma),
+            noise_read=Quantity.of(noise.read, "1", about, noise.read_sigma, made_with),
+            noise_shot=Quantity.of(noise.shot, "1", about, noise.shot_sigma, made_with),
         )
         print(_describe_noise(noise, named))
     save_calibration(found, out)

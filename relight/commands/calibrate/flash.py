@@ -76,7 +76,7 @@ def run(args: argparse.Namespace) -> None:
     with StageProgress() as progress:
         collected = collect_boards(pairs.pairs(), pairs.count, board, calibration, progress)
         found = calibrate_flash(collected, calibration, args.paper_albedo, progress)
-    save_flash(found, board, out, args.source.name)
+    save_flash(found, board, out, args.source.name, pairs.controls)
     print(f"pictures    {'; '.join([found.pairs, *pairs.left_out])}; linear by {pairs.transfer}")
     print(_describe(found))
     print(f"saved       {out}, and what it was made from in {flash_evidence_path(out).name}")

@@ -31,18 +31,22 @@ def run(args: argparse.Namespace) -> None:
     from calib.calibration import Calibration, Quantity, load_calibration, save_calibration
     from calib.sensor.flat_field import fit_flat_field
     from calib.stills import read_stills
+    from capture.controls import common_controls
 
     out = args.out / "calibration.json" if args.out.is_dir() else args.out
     known = load_calibration(out)
     response, named = chosen_response(known, args.transfer)
-    result = fit_flat_field(list(read_stills(args.source)), response, known.value("dark"))
+    stills = list(read_stills(args.source))
+    result = fit_flat_field(stills, response, known.value("dark"))
+    made_with = common_controls(still.controls for still in stills).mattering("flat_field")
     corner, sigma = _corner(result)
     about = (
         f"{len(result.flats)} flats of {', '.join(path.name for path in args.source)}, {result.size[0]} x "
         f"{result.size[1]}, linearised by {named}; the corner gets {corner:.3f} ± {sigma:.3f}"
     )
     print(_describe(result, named))
-    save_calibration(Calibration(flat_field=Quantity.of(result.terms, "1", about, result.sigma)), out)
+    flat = Quantity.of(result.terms, "1", about, result.sigma, made_with)
+    save_calibration(Calibration(flat_field=flat), out)
     print(f"saved       {out}")
 
 

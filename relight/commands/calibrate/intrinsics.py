@@ -12,6 +12,7 @@ from relight.commands.calibrate.flags import add_out
 
 if TYPE_CHECKING:
     from calib.lens.intrinsics import IntrinsicsResult
+    from capture.controls import Controls
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -72,13 +73,23 @@ def run(args: argparse.Namespace) -> None:
         result = calibrate_intrinsics(found.views, board, args.model, progress)
     distance_m = args.distance_m or float(np.median(result.distances_m))
     source = ", ".join(path.name for path in args.source)
-    save_intrinsics(result, out, source, distance_m)
+    save_intrinsics(result, out, source, distance_m, _controls(args.source))
     print(f"pictures    {found.describe()}")
     print(_describe(result, distance_m))
     print(f"saved       {out}, and what it was made from in {evidence_path(out).name}")
     if args.report:
         write_intrinsics_report(result, args.report, distance_m, found.describe(), f"Lens of {source}")
         print(f"report      {args.report}  (open it in a browser)")
+
+
+def _controls(sources: list[Path]) -> Controls:
+    """The settings of the camera, where all sources are sessions, which tell them."""
+    from capture.controls import Controls, common_controls
+    from capture.session import Session
+
+    if not all((source / "session.json").is_file() for source in sources):
+        return Controls()
+    return common_controls(Session.open(source).controls for source in sources)
 
 
 def _describe(result: IntrinsicsResult, distance_m: float) -> str:
