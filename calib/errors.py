@@ -7,6 +7,8 @@ CalibrationError
 ├── ResponseError    an exposure sweep does not tell a camera's response
 ├── NoiseError       pictures do not tell dark level or noise
 ├── FlatFieldError   pictures of an even surface do not tell how the lens falls off
+├── ColourError      pictures of a chart do not tell colours
+├── ReportError      a calibration cannot be shown
 └── FlashGeometryError  pictures of a board do not tell where the flash is and how it shines
 
 Every message is one sentence for the user: what is wrong, with its name, value and limit, and what to do
@@ -42,3 +44,11 @@ class FlatFieldError(CalibrationError):
 
 class FlashGeometryError(CalibrationError):
     """Pictures of a board with and without flash do not tell where the flash is and how it shines."""
+
+
+class ColourError(CalibrationError):
+    """Pictures of a colour chart do not tell how camera RGB becomes colours."""
+
+
+class ReportError(CalibrationError):
+    """There is no calibration to show."""

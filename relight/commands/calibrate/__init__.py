@@ -18,6 +18,10 @@ _PARTS = {
     ),
     "dark": ("relight.commands.calibrate.dark", "dark level and noise, from dark pictures and from pairs"),
     "flat": ("relight.commands.calibrate.flat", "the lens' fall-off to the corners, from an even surface"),
+    "colour": (
+        "relight.commands.calibrate.colour",
+        "camera RGB to true colours under flash and room, from a ColorChecker",
+    ),
     "flash": ("relight.commands.calibrate.flash", "where the flash is and how it shines, from a lit board"),
     "convert": (
         "relight.commands.calibrate.convert",
