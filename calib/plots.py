@@ -167,6 +167,57 @@ def histogram(values: Floats, sigma: float, label: str) -> str:
     return svg(width, height + 22, [*marks, line, *ticks], label)
 
 
+def graph(
+    curves: Sequence[tuple[Floats, Floats, str]],
+    label: str,
+    axes: tuple[str, str],
+    band: tuple[Floats, Floats, Floats] | None = None,
+) -> str:
+    """Curves over numbered axes.
+
+    Args:
+        curves: x [n], y [n] and the colour of each, such as "var(--ink)".
+        label: what it shows.
+        axes: names of x and y.
+        band: x [n], lower [n] and upper [n] end of a shaded region.
+    """
+    width, height, left, bottom = 640.0, 260.0, 64.0, 40.0
+    ys = [y for _, y, _ in curves] + ([] if band is None else [band[1], band[2]])
+    x_all, y_all = np.concatenate([x for x, _, _ in curves]), np.concatenate(ys)
+    low, high = np.array([x_all.min(), y_all.min()]), np.array([x_all.max(), y_all.max()])
+    span = np.maximum(high - low, 1e-12)
+
+    def at(x: Floats, y: Floats) -> tuple[Floats, Floats]:
+        across = left + (x - low[0]) / span[0] * (width - left - 8)
+        return across, (height - bottom) - (y - low[1]) / span[1] * (height - bottom - 12)
+
+    parts = []
+    if band is not None:
+        x, lower = at(band[0], band[1])
+        _, upper = at(band[0], band[2])
+        points = [f"{a:.1f},{b:.1f}" for a, b in zip(x, lower, strict=True)]
+        points += [f"{a:.1f},{b:.1f}" for a, b in zip(x[::-1], upper[::-1], strict=True)]
+        parts.append(f'<polygon points="{" ".join(points)}" fill="var(--accent)" fill-opacity="0.25"/>')
+    parts += [curve_path(*at(x, y), f"stroke:{colour};stroke-width:1.6") for x, y, colour in curves]
+    small = 'font-size="12" fill="var(--quiet)"'
+    for share in (0.0, 0.5, 1.0):
+        value = low + share * span
+        x, y = at(value[:1], value[1:])
+        parts.append(
+            f'<text x="{x[0]:.0f}" y="{height - bottom + 16:.0f}" {small} text-anchor="middle">'
+            f'{value[0]:.3g}</text><text x="{left - 6:.0f}" y="{y[0] + 4:.0f}" {small} text-anchor="end">'
+            f"{value[1]:.3g}</text>"
+        )
+    corner = f"M{left} 8V{height - bottom}H{width - 8}"
+    parts += [
+        f'<path d="{corner}" fill="none" stroke="var(--line)"/>',
+        f'<text x="{width / 2:.0f}" y="{height - 4:.0f}" {small} text-anchor="middle">'
+        f"{escape(axes[0])}</text>",
+        f'<text x="4" y="12" {small}>{escape(axes[1])}</text>',
+    ]
+    return svg(width, height, parts, label)
+
+
 def curve_path(x: Floats, y: Floats, style: str) -> str:
     """A line through points."""
     points = "L".join(f"{a:.1f} {b:.1f}" for a, b in zip(x, y, strict=True))

@@ -5,7 +5,6 @@ One HTML file without scripts and without anything from elsewhere: it can be sen
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
 from html import escape
 from pathlib import Path
 
@@ -18,28 +17,10 @@ from calib.lens.projection import project, rays_of
 from calib.lens.terms import LENS_MODELS, LENS_NAMES
 from calib.lens.uncertainty import pixel_grid, projection_sigma
 from calib.plots import arrows, bars, curve_path, dots, heat_map, histogram, svg
+from calib.report.page import figure, page, section, table, warnings
 from capture.atomic import atomic_write
 
 Floats = NDArray[np.float64]
-
-_STYLE = """
-:root { color-scheme: light dark; --page: #f7f6f3; --card: #fff; --ink: #1d1d1b; --quiet: #6d6b66;
-  --line: #c9c6bf; --accent: #b4541a }
-@media (prefers-color-scheme: dark) { :root { --page: #161615; --card: #1f1f1d; --ink: #ebe9e4;
-  --quiet: #98958d; --line: #45433f; --accent: #f0a35c } }
-body { margin: 0; background: var(--page); color: var(--ink); font: 15px/1.5 system-ui, sans-serif }
-main { max-width: 1080px; margin: 0 auto; padding: 40px 24px 80px }
-h1 { font-size: 28px; margin: 0 } h2 { font-size: 18px; margin: 40px 0 8px }
-p { max-width: 78ch; margin: 6px 0 12px } .quiet, th, figcaption { color: var(--quiet) }
-table { border-collapse: collapse; background: var(--card); font-size: 14px }
-th, td { text-align: left; padding: 5px 14px; border: 1px solid var(--line);
-  font-variant-numeric: tabular-nums }
-.grid { display: grid; gap: 14px; grid-template-columns: repeat(auto-fill, minmax(420px, 1fr)) }
-figure { margin: 0; background: var(--card); border: 1px solid var(--line); border-radius: 8px;
-  padding: 10px }
-figure svg { display: block; width: 100%; height: auto } figcaption { font-size: 13px; padding-top: 6px }
-.warnings { border-left: 3px solid var(--accent); padding: 2px 0 2px 14px; list-style: none }
-"""
 
 
 def write_intrinsics_report(
@@ -56,10 +37,10 @@ def write_intrinsics_report(
     """
     sections = [
         _head(result, distance_m, found, title),
-        _warnings(result.warnings),
-        _section("The lens", _lens_table(result), ""),
-        _section("How far a projected pixel may be off", _uncertainty(result, distance_m), ""),
-        _section(
+        warnings(result.warnings),
+        section("The lens", _lenstable(result), ""),
+        section("How far a projected pixel may be off", _uncertainty(result, distance_m), ""),
+        section(
             "Two halves of the pictures",
             _halves(result),
             "Each half calibrated on its own; the pixels to which both project the same rays should differ "
@@ -68,20 +49,15 @@ def write_intrinsics_report(
             "does "
             "not follow it.",
         ),
-        _section("What the residuals say", _residuals(result), ""),
-        _section(
+        section("What the residuals say", _residuals(result), ""),
+        section(
             "Why this model",
             _models(result),
             "Error on pictures that the lens was not fitted to; the smallest one decides.",
         ),
-        _section("The pictures", _pictures(result), ""),
+        section("The pictures", _pictures(result), ""),
     ]
-    page = (
-        f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{escape(title)}</title>'
-        f'<meta name="viewport" content="width=device-width, initial-scale=1"><style>{_STYLE}</style></head>'
-        f"<body><main>{''.join(sections)}</main></body></html>\n"
-    )
-    atomic_write(path, page.encode())
+    atomic_write(path, page(title, sections).encode())
 
 
 def _head(result: IntrinsicsResult, distance_m: float, found: str, title: str) -> str:
@@ -97,12 +73,7 @@ def _head(result: IntrinsicsResult, distance_m: float, found: str, title: str) -
     )
 
 
-def _warnings(sentences: Sequence[str]) -> str:
-    items = "".join(f"<li>{escape(sentence)}</li>" for sentence in sentences)
-    return f"<h2>To know</h2><ul class=warnings>{items}</ul>" if items else ""
-
-
-def _lens_table(result: IntrinsicsResult) -> str:
+def _lenstable(result: IntrinsicsResult) -> str:
     width, height = result.size
     free = {*LENS_NAMES[:4], *LENS_MODELS[result.model]}
     rows = [
@@ -122,10 +93,10 @@ def _lens_table(result: IntrinsicsResult) -> str:
         ]
     view = np.degrees(2 * np.arctan(np.array([width, height]) / (2 * result.lens[:2])))
     return (
-        _table(("", "value", "one standard deviation"), rows)
+        table(("", "value", "one standard deviation"), rows)
         + f"<p class=quiet>Pictures of {width} × {height} pixels; pixel centres at 0.5. Field of view "
         f"(without distortion) {view[0]:.1f}° × {view[1]:.1f}°.</p>"
-        + f'<div class="grid">{_figure(_distortion(result), _distortion_words(result))}</div>'
+        + f'<div class="grid">{figure(_distortion(result), _distortion_words(result))}</div>'
     )
 
 
@@ -137,14 +108,14 @@ def _uncertainty(result: IntrinsicsResult, distance_m: float) -> str:
         '<div class="grid">'
         + "".join(
             [
-                _figure(
+                figure(
                     heat_map(sigma, columns, result.size, hull, "projection uncertainty", "px"),
                     f"One standard deviation in the worst direction, px, of a point {distance_m:.2f} m away; "
                     "dashed: "
                     "what the corners span. The boards were "
                     f"{near.min():.2f} to {near.max():.2f} m away.",
                 ),
-                _figure(
+                figure(
                     dots(
                         result.observations.pixels[result.observations.seen],
                         result.size,
@@ -164,7 +135,7 @@ def _halves(result: IntrinsicsResult) -> str:
         return "<p>There are too few pictures for halves that tell anything.</p>"
     _, (columns, _) = pixel_grid(result.size)
     figures = [
-        _figure(
+        figure(
             heat_map(check.difference_px, columns, result.size, None, "difference of the halves", "px"),
             f"{check.split.capitalize()}: {check.rms_px:.3f} px apart where {check.expected_px:.3f} px are "
             "expected "
@@ -190,17 +161,17 @@ def _residuals(result: IntrinsicsResult) -> str:
         '<div class="grid">'
         + "".join(
             [
-                _figure(
+                figure(
                     drawn,
                     f"Found minus projected, {larger:g} times as long. Neighbours that point the same way "
                     "are an error "
                     "of the model; a mess is noise.",
                 ),
-                _figure(
+                figure(
                     histogram(whitened[seen].ravel(), 1.0, "residuals over the noise of their picture"),
                     "Residuals over the noise of their picture, and the normal distribution.",
                 ),
-                _figure(
+                figure(
                     bars(each, result.views, "residual by picture"),
                     f"Root mean square by picture, px, in the order in which they came ({result.rms_px:.3f} "
                     "over all).",
@@ -222,7 +193,7 @@ def _models(result: IntrinsicsResult) -> str:
         )
         for trial in result.trials
     ]
-    return _table(("distortion", "held-out error", ""), rows)
+    return table(("distortion", "held-out error", ""), rows)
 
 
 def _pictures(result: IntrinsicsResult) -> str:
@@ -240,7 +211,7 @@ def _pictures(result: IntrinsicsResult) -> str:
     ]
     corners, views = result.left_out
     note = f"<p class=quiet>Left out as outliers: {corners} corners, and {views} whole pictures.</p>"
-    return note + _table(("picture", "corners", "distance", "tilt", "noise"), rows)
+    return note + table(("picture", "corners", "distance", "tilt", "noise"), rows)
 
 
 def _map(result: IntrinsicsResult, distance_m: float) -> tuple[Floats, int]:
@@ -281,17 +252,3 @@ def _distortion_words(result: IntrinsicsResult) -> str:
     grid, _ = pixel_grid(result.size)
     moved = np.linalg.norm(project(result.lens, rays_of(straight, grid)) - grid, axis=1)
     return f"A square grid (grey) as the lens draws it (coloured): moved by up to {moved.max():.1f} px."
-
-
-def _figure(drawing: str, caption: str) -> str:
-    return f"<figure>{drawing}<figcaption>{escape(caption)}</figcaption></figure>"
-
-
-def _section(title: str, body: str, about: str) -> str:
-    intro = f"<p class=quiet>{escape(about)}</p>" if about else ""
-    return f"<h2>{escape(title)}</h2>{intro}{body}"
-
-
-def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    body = "".join("<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in rows)
-    return "<table><tr>" + "".join(f"<th>{escape(name)}</th>" for name in head) + f"</tr>{body}</table>"

@@ -1,5 +1,8 @@
 """Boards seen by a known lens: as corners with known noise, and as pictures rendered through the lens."""
 
+import re
+from html.parser import HTMLParser
+
 import cv2
 import numpy as np
 import pytest
@@ -9,6 +12,7 @@ from calib.board.detection import BoardView
 from calib.lens.bundle import Solution, minimise, observations_of
 from calib.lens.projection import project
 from calib.lens.uncertainty import uncertainty_of
+from relight.cli import main
 
 SIZE = (480, 360)
 LENS = np.array([420.0, 421.5, 242.3, 177.1, -0.22, 0.08, 0.001, -0.0015, 0.0])
@@ -117,6 +121,25 @@ def fit():
         return observations, found, uncertainty_of(observations, found, free)
 
     return from_truth
+
+
+@pytest.fixture(scope="session")
+def read_page():
+    """read_page(calibration) -> the HTML of its report, which needs nothing from elsewhere and has no nan."""
+
+    def read(calibration):
+        out = calibration.with_suffix(".html")
+        assert main(["calibrate", "report", str(calibration), "--out", str(out)]) == 0
+        html = out.read_text()
+        for outside in ("http:", "https:", "<script", "src="):
+            assert outside not in html
+        assert html.count("<svg") == html.count("</svg>")
+        assert "nan" not in re.sub(r"<[^>]*>", "", html)
+        assert not re.search(r'="[^"]*nan', html)
+        HTMLParser().feed(html)
+        return html
+
+    return read
 
 
 @pytest.fixture(scope="session")

@@ -38,7 +38,7 @@ def check_lens(path, lens):
 
 
 def test_stills_become_a_calibration_a_report_and_files_for_other_tools(
-    tmp_path, capsys, stills, board, lens
+    tmp_path, capsys, stills, board, lens, read_page
 ):
     save_board(board, tmp_path / "board.json")
     out, page = tmp_path / "calibration.json", tmp_path / "lens.html"
@@ -64,6 +64,10 @@ def test_stills_become_a_calibration_a_report_and_files_for_other_tools(
         assert outside not in html
     assert "nan" not in re.sub(r"<[^>]*>", "", html)
     assert not re.search(r'="[^"]*nan', html)
+
+    whole = read_page(out)
+    assert "Lens</td><td>" in whole
+    assert "projection uncertainty" in whole
 
     for name in ("lens.yml", "cameras.txt", "camchain.yaml", "lens.cameramodel"):
         assert main(["calibrate", "convert", str(out), "--out", str(tmp_path / name)]) == 0

@@ -23,6 +23,7 @@ _PARTS = {
         "camera RGB to true colours under flash and room, from a ColorChecker",
     ),
     "flash": ("relight.commands.calibrate.flash", "where the flash is and how it shines, from a lit board"),
+    "report": ("relight.commands.calibrate.report", "a page to judge a calibration by, in one file"),
     "convert": (
         "relight.commands.calibrate.convert",
         "intrinsics from or for OpenCV, ROS, COLMAP, Kalibr or mrcal",

@@ -157,7 +157,7 @@ def look(pair, board=BOARD, flat_field=None):
     return lit_board(as_pair(*pair), BoardDetector(board), LENS, flat_field)
 
 
-def test_a_folder_of_pairs_becomes_a_flash_within_its_uncertainty(tmp_path, pairs, capsys):
+def test_a_folder_of_pairs_becomes_a_flash_within_its_uncertainty(tmp_path, pairs, capsys, read_page):
     folder = folder_of(pairs, tmp_path)
     assert command(folder, "--out", tmp_path / "out.json") == 0
     said = capsys.readouterr().out
@@ -187,6 +187,9 @@ def test_a_folder_of_pairs_becomes_a_flash_within_its_uncertainty(tmp_path, pair
     droop = evidence["droop"]
     assert abs(droop["change"] - (0.98 / 1.02 - 1)) < 4 * droop["sigma"] < 0.04
     assert evidence["held_out"]["rms"] < 1.5 * evidence["held_out"]["expected"] < 0.03
+    page = read_page(tmp_path / "out.json")
+    assert "boards left out are off by" in page
+    assert page.count("<svg") >= 4
     assert not (tmp_path / "calibration.json").exists()
 
 

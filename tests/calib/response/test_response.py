@@ -201,7 +201,7 @@ def test_a_poor_sweep_is_refused_with_its_reason(frames, words):
         fit_response(gather_groups(frames()))
 
 
-def test_a_folder_with_a_list_becomes_a_response(tmp_path, capsys):
+def test_a_folder_with_a_list_becomes_a_response(tmp_path, capsys, read_page):
     folder = tmp_path / "sweep"
     folder.mkdir()
     with (folder / "exposures.csv").open("w", newline="") as file:
@@ -221,6 +221,9 @@ def test_a_folder_with_a_list_becomes_a_response(tmp_path, capsys):
     evidence = json.loads((tmp_path / "calibration.response.json").read_text())
     assert len(evidence["frames"]) == 10
     assert len(evidence["sigma"]) == 256
+    page = read_page(out)
+    assert "Response</td><td>good" in page
+    assert "Debevec (OpenCV)" in page
 
 
 def test_a_session_s_own_exposures_count_and_the_response_goes_into_it(tmp_path):
