@@ -69,7 +69,7 @@ def observe_points(scene: Scene, surface: SurfaceCloud, progress: Progress = no_
             layers.append(_eroded(observation.mask)[None])
         trusted_until = len(layers) + 2
         if observation.variance is not None:
-            layers.append(observation.variance[None])
+            layers.append(observation.variance.where(observation.valid > 0, 0.0)[None])
             variance = cosine.new_zeros(count, total) if variance is None else variance
         seen = (slant > _GRAZING).nonzero()[:, 0]
         samples = sample_bilinear(torch.cat(layers), uv_px[seen])

@@ -8,6 +8,7 @@ from analytic_scene import Frame, MemoryScene, looking_at
 from capture.cameras import Camera
 from relight.cloud import SurfaceCloud
 from relight.observations import observe_points, sample_bilinear, visible_points
+from relight.scene import NoiseModel
 
 # A head, and a small ball before it that hides some of it.
 CENTRES = np.array([[0.0, 0.0, 0.0], [0.05, 0.02, 0.2]])
@@ -160,10 +161,12 @@ def test_what_is_no_measurement_does_not_reach_its_neighbours(value):
     point = np.array([[(20.5005 - 32) * 0.6 / (1.75 * 64), 0.0, 0.0]], np.float32)
     radiance = np.full((64, 64, 3), 0.3)
     radiance[:, 21] = value
-    scene = flat_scene(radiance, np.ones((64, 64), bool), point, point, with_masks=False)
+    noise = NoiseModel(np.full(3, 0.01), np.full(3, 1e-3))
+    scene = flat_scene(radiance, np.ones((64, 64), bool), point, point, with_masks=False, noise=noise)
     observed = observe_points(scene, surface_of(point, np.array([[0.0, 0.0, 1.0]])))
     assert observed.cosine[0, 0] > 0.9
     np.testing.assert_allclose(observed.radiance[0, 0], 0.3, rtol=1e-3)  # the share
+    np.testing.assert_allclose(observed.variance[0, 0], (0.01**2 + 1e-3 * 0.3) / 3, rtol=1e-3)
 
 
 def test_off_the_mask_and_at_its_edge_points_have_no_weight_and_count_as_outside():
