@@ -10,7 +10,10 @@ import torch
 from numpy.typing import NDArray
 
 from capture.cameras import Camera
-from relight.scene import CLIPPED_RADIANCE, Observation, Scene, View
+from capture.radiometry import Radiometry
+from capture.response import Response
+from relight.lamp import Lamp
+from relight.scene import CLIPPED_RADIANCE, NoiseModel, Observation, Scene, View
 from relight.stress.subject import (
     FLASH_OFFSET_CAM_M,
     SUBJECT,
@@ -30,7 +33,10 @@ class FilmedScene(Scene):
     Attributes:
         radiances: [H, W, 3] of each view; to be spoilt.
         masks: [H, W] of each view; to be spoilt.
+        noise: Of the pixels, where it is known.
     """
+
+    noise: NoiseModel | None = None
 
     def __init__(
         self,
@@ -69,7 +75,11 @@ class FilmedScene(Scene):
         radiance = torch.from_numpy(self.radiances[view.index])
         valid = (radiance.abs().amax(dim=-1) < self._clip).float()
         mask = torch.from_numpy(self.masks[view.index].astype(np.float32))
-        return Observation(radiance, valid, mask)
+        variance = None
+        if self.noise is not None:
+            exposure = self.radiances[view.index]
+            variance = torch.from_numpy(self.noise.variance(exposure, Radiometry(Response("linear"))))
+        return Observation(radiance, valid, mask, variance)
 
 
 def film(
@@ -82,7 +92,9 @@ def film(
     cameras = arc(10) if cameras is None else cameras
     frames = [photograph(subject, camera) for camera in cameras]
     radiances, masks = [frame[0] for frame in frames], [frame[1] for frame in frames]
-    return FilmedScene(cameras, radiances, masks, surface_points(cloud), clip=clip)
+    scene = FilmedScene(cameras, radiances, masks, surface_points(cloud), clip=clip)
+    scene.lamp = Lamp(falloff=subject.beam)
+    return scene
 
 
 def filmed_twice() -> FilmedScene:
@@ -100,6 +112,13 @@ def with_broken_pixels(
         for value in values:
             v, u = random.integers(0, view.camera.height, (2, count))
             scene.radiances[view.index][v, u, random.integers(0, 3)] = value
+    return scene
+
+
+def with_known_noise(read: float, shot: float, values: Sequence[float] = ()) -> FilmedScene:
+    """A noise model, and some values in some pixels of every frame."""
+    scene = with_broken_pixels(values)
+    scene.noise = NoiseModel(np.full(3, read), np.full(3, shot))
     return scene
 
 

@@ -55,14 +55,15 @@ Made = Callable[[], Checked]
 def cases() -> Iterator[Case]:
     """All cases of this module."""
     for name in kinds():
-        yield _checked(f"shade, {name}: albedo, normals, shading, points, colours", partial(_shade, name))
-    yield _checked("shade, glossy point: the same", partial(_shade, "point", _SKIN))
-    yield _checked("shade, the light's own colour and place", _own_colours)
+        yield checked(f"shade, {name}: albedo, normals, shading, points, colours", partial(_shade, name))
+    yield checked("shade, glossy point: the same", partial(_shade, "point", _SKIN))
+    yield checked("shade, the light's own colour and place", _own_colours)
     for name, operator in _OPERATORS.items():
-        yield _checked(name, operator)
+        yield checked(name, operator)
 
 
-def _checked(stressed: str, made: Made) -> Case:
+def checked(stressed: str, made: Made) -> Case:
+    """The case of one operator."""
     return Case(GRADIENTS, stressed, partial(_against_differences, made))
 
 

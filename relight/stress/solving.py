@@ -77,6 +77,8 @@ _LIGHTS = {
     "flash ten times the room": Subject(room=0.05, flash=0.11),
     "flash a tenth of the room": Subject(room=0.5, flash=0.0125),
     "dark room": Subject(room=0.0),
+    "flash of a wide beam": Subject(beam=1.0),
+    "flash of a beam of 15 degrees": Subject(beam=80.0),
 }
 
 _GONE_WRONG: dict[str, Callable[[], Scene]] = {
@@ -85,6 +87,12 @@ _GONE_WRONG: dict[str, Callable[[], Scene]] = {
     "NaN, Inf and 1e38 in every frame": partial(captures.with_broken_pixels, (*_BROKEN, 1e38)),
     "hot pixels of 1e4 that no clip takes out": partial(captures.with_broken_pixels, (1e4,), 3, np.inf),
     "one frame all NaN": captures.with_broken_frame,
+    "noise that is known": partial(captures.with_known_noise, 0.002, 1e-4),
+    "noise that is known, NaN and Inf in every frame": partial(
+        captures.with_known_noise, 0.002, 1e-4, _BROKEN
+    ),
+    "noise of zero": partial(captures.with_known_noise, 0.0, 0.0),
+    "noise of 1e3": partial(captures.with_known_noise, 1e3, 1e3),
     "cloud with NaN, Inf, copies, points at and behind the cameras": captures.with_hostile_cloud,
     "cloud with zero and NaN normals": captures.with_hostile_normals,
     "a camera a millimetre from the surface": captures.from_the_skin,

@@ -33,13 +33,15 @@ class Subject:
         albedo: Factor on the albedo; 0 = black.
         jacket: Factor on the albedo below the chin.
         room: Radiance of a white surface under the brightest of the room's light.
-        flash: Radiance of a white surface that faces the flash from one metre.
+        flash: Radiance of a white surface that faces the flash from one metre, before it.
+        beam: mu of the flash's cos(angle to the optical axis)^mu.
     """
 
     albedo: float = 1.0
     jacket: float = 1.0
     room: float = 0.25
     flash: float = 0.11
+    beam: float = 0.0
 
     def albedo_at(self, points: Floats) -> Floats:
         """[..., 3] at points [..., 3] of the surface, between 0.2 and 0.7 times the factors."""
@@ -56,7 +58,9 @@ class Subject:
             towards = flash_position(camera) - points
             square = (towards**2).sum(axis=-1, keepdims=True)
             cosine = (normals * towards).sum(axis=-1, keepdims=True) / np.sqrt(square)
-            irradiance = irradiance + self.flash / square * cosine.clip(min=0.0)
+            ahead = -(towards @ camera.cam_from_world[2, :3])[..., None] / np.sqrt(square)
+            beam = ahead.clip(min=0.0) ** self.beam
+            irradiance = irradiance + self.flash * beam / square * cosine.clip(min=0.0)
         return self.albedo_at(points) * irradiance
 
 
