@@ -14,6 +14,8 @@ no-flash frame a point shows its room radiance; a flash frame adds
 3. normals: robust least squares for b = albedo * n under the frames' light directions (Woodham 1980), with
    the geometric normal as a prior in the directions that the lights do not span. The prior's weight is the
    ratio of the two variances, the photometric one measured from the residual;
+   or, with `SolveConfig.shape`, as those of a surface that moves until its shading fits
+   (`relight.shape_from_flash`), on which steps 1 and 2 are then done again;
 4. albedo: robust least squares per channel;
 5. points that the flash did not reach are filled, on a face from its other side (`relight.mirror_infill`),
    else from their neighbours (`relight.infill`).
@@ -38,7 +40,7 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
-from relight.cloud import CloudConfig, prepare_cloud
+from relight.cloud import CloudConfig, SurfaceCloud, prepare_cloud
 from relight.errors import PlanError
 from relight.infill import infill
 from relight.lamp import Lamp, beam
@@ -47,6 +49,7 @@ from relight.observations import Observations, observe_points
 from relight.portrait import Portrait
 from relight.reflectance import GRAZING, Reflectance, fit_local_gloss, fit_reflectance
 from relight.scene import Scene
+from relight.shape_from_flash import FlashResponses, ShapeConfig, refine_shape
 from relight.stages import Progress, no_progress
 
 ALBEDO_95 = 0.6
@@ -85,6 +88,8 @@ class SolveConfig:
             Lambertian.
         fit_gains: Whether the flash frames' gains are fitted; otherwise all flashes are taken as equal.
         mirror: Whether what no flash reached of a face is taken from its other side, before its neighbours.
+        shape: How the cloud's surface is made to fit its shading (`relight.shape_from_flash`); None = it
+            stays as the cloud has it, and only normals are fitted.
         known: Information (sum of weighted squared cosines over the flash frames) that makes an albedo
             known: 0.25 is one flash frame at 60 degrees.
     """
@@ -94,6 +99,7 @@ class SolveConfig:
     fit_gloss: bool = True
     fit_gains: bool = True
     mirror: bool = True
+    shape: ShapeConfig | None = None
     known: float = 0.25
 
 
@@ -128,7 +134,7 @@ def solve(scene: Scene, config: SolveConfig = SolveConfig(), progress: Progress 
     Args:
         scene: With at least one flash and one no-flash frame.
         config: See there.
-        progress: Told ("cloud" | "observe" | "solve", fraction).
+        progress: Told ("cloud" | "observe" | "shape" | "solve", fraction).
 
     Raises:
         PlanError: There are no flash or no no-flash frames, or too few points, or the frames do not see the
@@ -144,39 +150,20 @@ def solve(scene: Scene, config: SolveConfig = SolveConfig(), progress: Progress 
         scene.points.cpu().numpy(), normals_given, [view.camera for view in scene.views], config.cloud
     )
     progress("cloud", 1.0)
-    observations = observe_points(scene, surface, progress)
-    progress("solve", 0.0)
+    measured = _measure(scene, surface, config, progress)
+    if config.shape is not None:
+        surface = _shaped(surface, measured, config.shape, progress)
+        measured = _measure(scene, surface, config, progress)
+    flash, relative, reflectance = measured.flash, measured.relative, measured.reflectance
     points = torch.from_numpy(surface.points).to(scene.device)
     prior = torch.from_numpy(surface.normals_world).to(scene.device)
-    # What masks carve away takes no part; it is dropped at the end, for a copy of the observations would be
-    # large.
-    on_subject = observations.outside <= _OUTSIDE_LIMIT
-    observations.cosine.mul_(on_subject)
-    if not bool((observations.cosine > 0).any()):
-        raise PlanError(
-            "No frame shows a point of the cloud, unclipped and inside its mask; are poses and cloud in the "
-            "same coordinates, and the frames exposed well?"
-        )
-
-    room, room_information = _room_radiance(observations)
-    tint, level = _strength(scene.lamp)
-    flash = _flash_part(observations, points, room, room_information, points.new_tensor(tint))
-    scale, reflectance, gains = _global_quantities(flash, prior, config)
-    lamps = observations.flash_position_world[observations.flash]
-    if scale < _FLOOR * float(((lamps - points.mean(dim=0)) ** 2).sum(dim=1).median()):
-        raise PlanError(
-            f"The flash frames are no brighter than the others (by less than {_FLOOR} of white); is the "
-            "flash flag of the frames right?"
-        )
-    normals, sigma = torch.empty_like(prior), points.new_empty(len(points))
+    normals, sigma = prior.clone(), points.new_empty(len(points))
     albedo, information, residual = torch.empty_like(prior), torch.empty_like(sigma), torch.empty_like(sigma)
-    flash = _normalised(flash, scale, gains)
-    flash = replace(flash, gloss=_local_gloss(flash, points, prior, reflectance, surface.spacing))
-    relative = _relative_noise(flash, prior, reflectance)
     prior_weight = (relative / config.normal_sigma_rad) ** 2
     for part in _chunks(len(points)):
         chunk = flash.of(part)
-        normals[part] = _fit_normals(chunk, prior[part], reflectance, prior_weight, relative)
+        if config.shape is None:  # else they fit the frames already
+            normals[part] = _fit_normals(chunk, prior[part], reflectance, prior_weight, relative)
         albedo[part], information[part], residual[part], sigma[part] = _fit_albedo(
             chunk, normals[part], reflectance, relative
         )
@@ -187,6 +174,7 @@ def solve(scene: Scene, config: SolveConfig = SolveConfig(), progress: Progress 
             "The flash frames do not light any point enough to solve for it; is the flash flag of the frames "
             "right, and is the subject what the flash lights?"
         )
+    room, room_information = measured.room, measured.room_information
     filled, worth, from_mirror = albedo, information, 0.0
     if config.mirror and float(known.float().mean()) < 1.0 - _MIRROR_WORTH:
         mirrored = mirror_infill(scene, points, normals, albedo, information, config.known)
@@ -194,7 +182,7 @@ def solve(scene: Scene, config: SolveConfig = SolveConfig(), progress: Progress 
         from_mirror = float(mirrored.filled.float().mean())
     albedo = infill(points, filled, worth, known=config.known, nearest=surface.spacing)
     room = infill(points, room, room_information, known=0.3, nearest=surface.spacing)
-    gauge, warnings = _gauge(albedo[known].mean(dim=1), scale, level)
+    gauge, warnings = _gauge(albedo[known].mean(dim=1), measured.scale, measured.level)
     albedo = (albedo * gauge).clamp(min=0.0)
     c_room, shading = _split_room(room, albedo, information > config.known)
     normal_sigma = _normal_sigma(information, relative, config.normal_sigma_rad)
@@ -215,23 +203,111 @@ def solve(scene: Scene, config: SolveConfig = SolveConfig(), progress: Progress 
         residual=residual,
         spacing=surface.spacing,
         c_room=_three(c_room),
-        c_flash=_three([scale / gauge * share for share in tint]),
+        c_flash=_three([measured.scale / gauge * share for share in measured.tint]),
         flash_offset_cam_m=_three(torch.as_tensor(scene.flash_offset_cam_m)),
         reflectance=Reflectance(reflectance.retro, reflectance.alpha, reflectance.f0 * gauge),
         info={
             "solver": "photometric",
             "frames": len(scene.views),
             "flash_frames": sum(flags),
-            "flash_gains": [round(float(gain), 4) for gain in gains],
+            "flash_gains": [round(float(gain), 4) for gain in measured.gains],
             "relative_noise": round(relative, 4),
             "cloud_noise": surface.noise,
             "known_share": round(float(known.float().mean()), 4),
             "mirrored_share": round(from_mirror, 4),
-            "absolute_albedo": level is not None and not warnings,
+            "absolute_albedo": measured.level is not None and not warnings,
             "warnings": warnings,
         },
     )
-    return portrait if bool(on_subject.all()) else portrait.subset(on_subject)
+    return portrait if bool(measured.on_subject.all()) else portrait.subset(measured.on_subject)
+
+
+@dataclass(frozen=True, eq=False)
+class _Measured:
+    """What the frames show of a surface.
+
+    Attributes:
+        on_subject: [P] bool, False for what the masks carve away.
+        room: [P, 3] radiance under the room's light.
+        room_information: [P] sum of weights that it rests on.
+        flash: In units of the albedo, with each point's gloss.
+        scale: Of C_flash.
+        gains: [K] of the flash frames.
+        reflectance: Of the subject.
+        relative: Standard deviation of a flash observation relative to its albedo.
+        tint: [3] colour of the flash, mean 1.
+        level: Calibrated strength of the flash, None = unknown.
+    """
+
+    on_subject: torch.Tensor
+    room: torch.Tensor
+    room_information: torch.Tensor
+    flash: _Flash
+    scale: float
+    gains: torch.Tensor
+    reflectance: Reflectance
+    relative: float
+    tint: list[float]
+    level: float | None
+
+
+def _measure(scene: Scene, surface: SurfaceCloud, config: SolveConfig, progress: Progress) -> _Measured:
+    """Samples the frames at a surface and fits what all its points share.
+
+    Raises:
+        PlanError: The frames do not show the surface, or are no brighter with the flash.
+    """
+    observations = observe_points(scene, surface, progress)
+    progress("solve", 0.0)
+    points = torch.from_numpy(surface.points).to(scene.device)
+    normals = torch.from_numpy(surface.normals_world).to(scene.device)
+    # What masks carve away takes no part; it is dropped at the end, for a copy of the observations would be
+    # large.
+    on_subject = observations.outside <= _OUTSIDE_LIMIT
+    observations.cosine.mul_(on_subject)
+    if not bool((observations.cosine > 0).any()):
+        raise PlanError(
+            "No frame shows a point of the cloud, unclipped and inside its mask; are poses and cloud in the "
+            "same coordinates, and the frames exposed well?"
+        )
+    room, room_information = _room_radiance(observations)
+    tint, level = _strength(scene.lamp)
+    flash = _flash_part(observations, points, room, room_information, points.new_tensor(tint))
+    scale, reflectance, gains = _global_quantities(flash, normals, config)
+    lamps = observations.flash_position_world[observations.flash]
+    if scale < _FLOOR * float(((lamps - points.mean(dim=0)) ** 2).sum(dim=1).median()):
+        raise PlanError(
+            f"The flash frames are no brighter than the others (by less than {_FLOOR} of white); is the "
+            "flash flag of the frames right?"
+        )
+    flash = _normalised(flash, scale, gains)
+    flash = replace(flash, gloss=_local_gloss(flash, points, normals, reflectance, surface.spacing))
+    relative = _relative_noise(flash, normals, reflectance)
+    return _Measured(
+        on_subject, room, room_information, flash, scale, gains, reflectance, relative, tint, level
+    )
+
+
+def _shaped(
+    surface: SurfaceCloud, measured: _Measured, config: ShapeConfig, progress: Progress
+) -> SurfaceCloud:
+    """The surface that explains the shading under the flash."""
+    progress("shape", 0.0)
+    flash = measured.flash
+    shape = refine_shape(
+        torch.from_numpy(surface.points).to(flash.gloss.device),
+        torch.from_numpy(surface.normals_world).to(flash.gloss.device),
+        FlashResponses(
+            flash.response.mean(dim=-1), flash.weight, flash.to_light, flash.gloss, measured.relative
+        ),
+        measured.reflectance,
+        spacing=surface.spacing,
+        cloud_noise=surface.noise,
+        config=config,
+    )
+    progress("shape", 1.0)
+    points, normals = (part.cpu().numpy() for part in (shape.points, shape.normals_world))
+    return replace(surface, points=points, normals_world=normals)
 
 
 def _room_radiance(observations: Observations) -> tuple[torch.Tensor, torch.Tensor]:
