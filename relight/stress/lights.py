@@ -35,7 +35,7 @@ from relight.stress.subject import looking_at_origin, sphere_points
 
 LIGHTS = Stage("lights")
 
-_DECADES = (-6, -3, 0, 3, 6)
+_DECADES = (-6, 0, 6)
 _LAMP = (0.2, 0.3, 0.4)
 _CAMERA = looking_at_origin([0.05, 0.1, 0.5], 64, flash=1)
 _COLOUR = (0.9, 1.0, 1.1)
