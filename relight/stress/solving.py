@@ -24,6 +24,7 @@ from relight.errors import PlanError
 from relight.photometric import SolveConfig, solve
 from relight.portrait import Portrait
 from relight.scene import Scene, load_scene
+from relight.shape_from_flash import ShapeConfig
 from relight.stress import captures
 from relight.stress.captures import film
 from relight.stress.case import Case, Measured, Stage, at_most
@@ -35,7 +36,8 @@ SOLVE = Stage(
     "frames and portraits are float32 by contract; normal equations are solved in float64",
 )
 
-_CONFIG = SolveConfig(cloud=CloudConfig(max_points=1000), mirror=False)  # the mirror has a case of its own
+# All of the solve but the mirror, which has a case of its own.
+_CONFIG = SolveConfig(cloud=CloudConfig(max_points=1000), shape=ShapeConfig(), mirror=False)
 _KNOWN = 0.6  # confidence of points that the flash observed well
 _USUAL = 0.05  # a thousand points of a head are 13 mm apart, and a wave of its albedo is 140 mm long
 _TOLERABLE_DEG = 3.0
@@ -56,6 +58,7 @@ def cases() -> Iterator[Case]:
     for stressed, scene in _GONE_WRONG.items():
         yield _solved(stressed, scene)
     yield Case(SOLVE, "NaN and Inf pixels in files", lambda _: _solved_from_files(), at_most(_USUAL))
+    yield _solved("the shape as the cloud has it", film, config=replace(_CONFIG, shape=None))
     one_side = partial(film, cameras=arc(10)[:5])
     mirrored = replace(_CONFIG, mirror=True)
     yield _solved("lit from one side only, mirrored", one_side, config=mirrored)
