@@ -26,7 +26,7 @@ _PARTS = {
     "report": ("relight.commands.calibrate.report", "a page to judge a calibration by, in one file"),
     "convert": (
         "relight.commands.calibrate.convert",
-        "intrinsics from or for OpenCV, ROS, COLMAP, Kalibr or mrcal",
+        "lens, response or flat field from or for OpenCV, ROS, COLMAP, Kalibr, mrcal or TUM",
     ),
 }
 
