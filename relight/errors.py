@@ -6,6 +6,7 @@ RelightError
 │   └── GeometryError poses, cloud or masks cannot be found in the frames
 ├── PortraitError    a portrait is missing or cannot be read
 ├── StressError      a stage is not stable under some input
+├── RefineError      a refinement lacks something, or cannot go on
 └── TruthError       a folder with ground truth cannot be used
 
 Every message is one sentence for the user: what is wrong, with its name, value and limit, and what to do
@@ -29,6 +30,10 @@ class GeometryError(PlanError):
 
 class PortraitError(RelightError):
     """A portrait is missing or cannot be read."""
+
+
+class RefineError(RelightError):
+    """A refinement lacks something that was named, or its numbers have gone astray."""
 
 
 class StressError(RelightError):

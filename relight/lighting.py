@@ -112,7 +112,9 @@ class CaptureLight:
         return surface.albedo * surface.vector(self.c_room) * surface.shading
 
     def flash_radiance(self, surface: Surface) -> Tensor:
-        """A C_flash / d^2 max(0, <n, l>): [P, 3]."""
+        """A C_flash / d^2 max(0, <n, l>): [P, 3]; or what the maps know of it."""
+        if surface.flash_radiance is not None:
+            return surface.flash_radiance
         if self.c_flash is None or self.camera is None:
             raise ValueError("a light with the flash in it needs c_flash and the camera")
         position = surface.vector(self.camera.centre_world)

@@ -58,9 +58,10 @@ class Preset:
 
 PRESETS: dict[str, Preset] = {
     "solve": Preset(),
+    "paper": Preset("relight.neural.paper.refine:refine_paper", "relight.neural.paper.config:PaperConfig"),
 }
 
-PRESETS_TO_COME = ("fast", "balanced", "paper")
+PRESETS_TO_COME = ("fast", "balanced")
 
 
 def chosen_preset(name: str) -> Preset:

@@ -23,8 +23,8 @@ class SurfaceMaps(Protocol):
     """What can be shaded: maps of a view, [...] = [H, W], or arrays of points, [...] = [P].
 
     Maps may also have a `room_radiance` [..., 3], linear: what the room's light makes of the surface, in
-    colour. It then takes the place of albedo * C_room * shading. And a `gloss` [...], a factor on the gloss
-    of a reflectance.
+    colour. It then takes the place of albedo * C_room * shading. Likewise a `flash_radiance` [..., 3], what
+    the camera's own flash adds. And a `gloss` [...], a factor on the gloss of a reflectance.
     """
 
     @property
@@ -94,6 +94,12 @@ class Surface:
     def room_radiance(self) -> Tensor | None:
         """[P, 3], linear, under the room's light; None where the maps know only a grey shading."""
         radiance = getattr(self._maps, "room_radiance", None)
+        return None if radiance is None else self._gather(radiance)
+
+    @cached_property
+    def flash_radiance(self) -> Tensor | None:
+        """[P, 3], linear, that the camera's own flash adds; None where it follows from the other maps."""
+        radiance = getattr(self._maps, "flash_radiance", None)
         return None if radiance is None else self._gather(radiance)
 
     @cached_property

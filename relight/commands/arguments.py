@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import json
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from relight.errors import PlanError, PortraitError
 
@@ -92,6 +93,53 @@ def chosen_geometry(args: argparse.Namespace) -> GeometryConfig:
     masks = MaskConfig() if args.u2net is None else MaskConfig(u2net=str(args.u2net))
     face = FaceConfig(model=str(args.face_landmarks or ""), maps=str(args.position_maps or ""))
     return GeometryConfig(sfm=sfm, masks=masks, face=face)
+
+
+def add_refinement(parser: argparse.ArgumentParser) -> None:
+    """What can be set of a preset that refines the solve; see `chosen_settings`."""
+    group = parser.add_argument_group("for presets that refine the solve")
+    group.add_argument("--steps", type=positive_integer, metavar="N", help="of the optimiser")
+    group.add_argument(
+        "--vgg",
+        type=Path,
+        metavar="FILE",
+        help="weights of VGG-16 (torchvision's state dict, or safetensors) to compare pictures with; "
+        "without, a measure is taken that needs none",
+    )
+    group.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help="any setting of the preset, such as crop=256 or precision=bfloat16",
+    )
+    group.add_argument(
+        "--seed", type=int, default=0, metavar="N", help="of what is drawn by chance (default: 0)"
+    )
+
+
+def chosen_settings(args: argparse.Namespace) -> dict[str, Any]:
+    """The settings that the flags of `add_refinement` ask for; the preset says which it has.
+
+    Raises:
+        PlanError: A flag is not of its form, or names a file that is not there.
+    """
+    settings: dict[str, Any] = {}
+    for text in args.set:
+        name, equals, value = text.partition("=")
+        if not (name and equals):
+            raise PlanError(f"--set {text} must be NAME=VALUE.")
+        try:
+            settings[name] = json.loads(value)
+        except ValueError:
+            settings[name] = value
+    if args.steps is not None:
+        settings["steps"] = args.steps
+    if args.vgg is not None:
+        if not args.vgg.is_file():
+            raise PlanError(f"{args.vgg} does not exist; name what --vgg shall use, or leave it out.")
+        settings["vgg"] = str(args.vgg)
+    return settings
 
 
 def add_max_seconds(parser: argparse.ArgumentParser) -> None:

@@ -13,7 +13,9 @@ from relight.commands.arguments import (
     add_forced,
     add_geometry,
     add_max_seconds,
+    add_refinement,
     chosen_geometry,
+    chosen_settings,
 )
 
 if TYPE_CHECKING:
@@ -47,19 +49,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--preset",
         default="solve",
         metavar="NAME",
-        help="how: solve, the photometric solve without a network (default, and the only one so far)",
+        help="how: solve, the photometric solve without a network (default); paper, the paper's network, "
+        "which takes hours",
     )
     parser.add_argument("--name", metavar="NAME", help="what to call the portrait (default: its preset)")
     parser.add_argument(
         "--fresh", action="store_true", help="do again what an earlier run left, though nothing has changed"
     )
-    parser.add_argument(
-        "--seed", type=int, default=0, metavar="N", help="of what a refinement draws by chance (default: 0)"
-    )
     add_max_seconds(parser)
     add_device(parser)
     add_forced(parser)
     add_geometry(parser)
+    add_refinement(parser)
 
 
 def run(args: argparse.Namespace) -> None:
@@ -70,7 +71,7 @@ def run(args: argparse.Namespace) -> None:
     from relight.fit import fit
     from relight.plan import parse_forced
 
-    forced, geometry = parse_forced(args.force), chosen_geometry(args)
+    forced, geometry, settings = parse_forced(args.force), chosen_geometry(args), chosen_settings(args)
     with StageProgress() as progress:
         session = session_of(args.source, args.out, progress)
         folder = fit(
@@ -81,6 +82,7 @@ def run(args: argparse.Namespace) -> None:
             name=args.name,
             forced=forced,
             geometry=geometry,
+            settings=settings,
             seed=args.seed,
             fresh=args.fresh,
             progress=progress,
