@@ -12,11 +12,13 @@ from relight.stress import (
     gradients,
     lights,
     measures,
+    networks,
     observing,
     projecting,
     reflecting,
     rendering,
     solving,
+    training,
 )
 from relight.stress.case import Case, Stage
 
@@ -29,6 +31,8 @@ _MODULES: tuple[Callable[[], Iterator[Case]], ...] = (
     lights.cases,
     environments.cases,
     measures.cases,
+    networks.cases,
+    training.cases,
     gradients.cases,
     drift.cases,
 )
