@@ -108,7 +108,7 @@ def read_vignette(path: Path) -> Quantity:
     if np.percentile(off, 95) > _LARGEST_OFF or not found[0] > 0:
         raise LensFileError(
             f"{path} is not radial: a curve by the distance from the centre leaves "
-            f"{np.percentile(off, 95):.1%} (at most {_LARGEST_OFF:.0%}), and a flat field here is such a curve."
+            f"{np.percentile(off, 95):.1%} (at most {_LARGEST_OFF:.0%}), and no other is known here."
         )
     made_with = Controls(width=width, height=height)
     return Quantity.of(found[1:] / found[0], "1", f"{path.name} (TUM)", None, made_with)

@@ -65,11 +65,11 @@ def fit_light(stack: Stack, start: Light, free: NDArray[np.int64], spread: Sprea
     found = spread or Spread(0.003, 0.01)
     light = start
     for _ in range(_ROUNDS):
-        roots = _error_roots(stack, light, found)
+        roots = error_roots(stack, light, found)
         light = _solved(stack, light, free, roots)
         if spread is None:
             found = _spread_of(stack, light, free, found)
-    information = _information(stack, light, free, _error_roots(stack, light, found))
+    information = _information(stack, light, free, error_roots(stack, light, found))
     covariance = np.zeros((LIGHT_SIZE, LIGHT_SIZE))
     covariance[np.ix_(free, free)] = np.linalg.pinv(information, hermitian=True)
     if spread is None:
@@ -100,7 +100,7 @@ def light_exponent(stack: Stack, fit: LightFit) -> tuple[float, float]:
     place and falloff follow as far as they can; what they cannot follow is seen here (one step from 1, with
     everything else free).
     """
-    roots = _error_roots(stack, fit.light, fit.spread)
+    roots = error_roots(stack, fit.light, fit.spread)
     level = log_light(fit.light, stack.points_cam, stack.normals_cam, stack.time)
     bent = np.where(stack.there, level - level[stack.there].mean(), 0.0)
     slopes = light_slopes(stack, fit.light, np.arange(LIGHT_SIZE))
@@ -198,7 +198,7 @@ def _information(stack: Stack, light: Light, free: NDArray[np.int64], roots: Flo
     return information
 
 
-def _error_roots(stack: Stack, light: Light, spread: Spread) -> Floats:
-    """[V, N, N] W with W^T W the inverse covariance; zero in rows that are not there."""
+def error_roots(stack: Stack, light: Light, spread: Spread) -> Floats:
+    """[V, N, N] W with W^T W the inverse covariance of the errors; zero in rows that are not there."""
     root = np.linalg.cholesky(error_covariance(stack, light, spread))
     return np.linalg.inv(root) * stack.there[:, :, None]

@@ -102,6 +102,7 @@ def calibrate_flash(
     calibration: Calibration,
     paper_albedo: float = 1.0,
     progress: Progress = lambda stage, fraction: None,
+    joint: Floats | None = None,
 ) -> FlashGeometry:
     """The flash that lit the boards.
 
@@ -110,6 +111,8 @@ def calibrate_flash(
         calibration: what else is known of the camera: its uncertainty enters the strength.
         paper_albedo: of the board's white; the strength is that of a surface of albedo 1.
         progress: told ("fit the flash", fraction).
+        joint: [8, 8] covariance of the light where the flat field was found along with it; None = the flat
+            field is known.
 
     Raises:
         FlashGeometryError: the boards cannot tell, for the reason said.
@@ -142,6 +145,9 @@ def calibrate_flash(
         )
     progress("fit the flash", 0.6)
     held_out = hold_out(boards, fit)
+    if joint is not None:
+        known = np.isin(everything, fit.free)
+        fit = replace(fit, covariance=np.where(known[:, None] & known, joint, 0.0))
     progress("fit the flash", 1.0)
     strength, covariance = _channels(boards, fit, calibration, paper_albedo)
     gains, gain_sigma = pulse_gains(stack, fit)

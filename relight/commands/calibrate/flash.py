@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -44,6 +45,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="albedo of the board's white (default 1: the strength is then that of this paper)",
     )
     parser.add_argument(
+        "--flat",
+        action="store_true",
+        help="find the lens's fall-off to the corners from the same light, where no flat field is known: a "
+        "flash some centimetres beside the lens and boards in all corners tell the two apart",
+    )
+    parser.add_argument(
         "--transfer",
         default="srgb",
         metavar="NAME",
@@ -54,9 +61,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> None:
     """Reads the pairs, finds the flash, saves and reports."""
     from calib.board.charuco import load_board
-    from calib.calibration import load_calibration
+    from calib.calibration import Calibration, load_calibration, save_calibration
     from calib.errors import FlashGeometryError
     from calib.flash.geometry import calibrate_flash
+    from calib.flash.lens_falloff import find_flat
+    from calib.flash.model import LIGHT_SIZE
     from calib.flash.pairs import open_pairs
     from calib.flash.samples import collect_boards, lens_vector
     from calib.flash.save import flash_evidence_path, save_flash
@@ -73,12 +82,30 @@ def run(args: argparse.Namespace) -> None:
     pairs = open_pairs(args.source, calibration, args.transfer)
     lens_vector(calibration.intrinsics)  # before the pictures are read, which takes long
     out = _file_of(args.out or known_at)
+    if args.flat and calibration.flat_field is not None:
+        raise FlashGeometryError(
+            f"{known_at} has a flat field already, which is taken off; leave out --flat, or the flat field."
+        )
+    flat, joint = None, None
     with StageProgress() as progress:
         collected = collect_boards(pairs.pairs(), pairs.count, board, calibration, progress)
-        found = calibrate_flash(collected, calibration, args.paper_albedo, progress)
+        if args.flat and calibration.intrinsics is not None:
+            flat = find_flat(collected, calibration.intrinsics)
+            collected = flat.evened
+            calibration = replace(calibration, flat_field=flat.entry(args.source.name, pairs.controls))
+            joint = flat.found.covariance[:LIGHT_SIZE, :LIGHT_SIZE]
+        found = calibrate_flash(collected, calibration, args.paper_albedo, progress, joint)
     save_flash(found, board, out, args.source.name, pairs.controls)
+    if flat is not None:
+        save_calibration(Calibration(flat_field=calibration.flat_field), out)
     print(f"pictures    {'; '.join([found.pairs, *pairs.left_out])}; linear by {pairs.transfer}")
     print(_describe(found))
+    if flat is not None:
+        passed, sigma = flat.found.corner
+        print(
+            f"lens        passes {passed:.3f} ± {sigma:.3f} in the corner; squares reach "
+            f"{flat.found.reach:.0%} of the way to it"
+        )
     print(f"saved       {out}, and what it was made from in {flash_evidence_path(out).name}")
 
 

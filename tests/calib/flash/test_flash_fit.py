@@ -13,16 +13,18 @@ import pytest
 from scipy.stats import chi2
 
 from calib.board.charuco import Board
-from calib.calibration import Calibration
-from calib.errors import FlashGeometryError
+from calib.calibration import Calibration, Intrinsics, Quantity
+from calib.errors import FlashGeometryError, FlatFieldError
 from calib.flash.boards import LitBoard, merged_stills, stacked
 from calib.flash.checks import check_fit, check_poses, distinct_poses, hold_out, weak_directions
 from calib.flash.fit import fit_light, pulse_gains
 from calib.flash.geometry import calibrate_flash
+from calib.flash.lens_falloff import find_flat, fit_lens_falloff
 from calib.flash.model import LIGHT_SIZE
 from calib.flash.samples import CollectedBoards
 from calib.flash.strangers import find_strangers
-from calib.lens.projection import project_with_slopes
+from calib.lens.projection import project, project_with_slopes
+from capture.controls import UNKNOWN
 
 BOARD = Board((5, 7), 0.03, 0.019)
 LENS = np.array([840.0, 842.0, 484.0, 354.0, -0.2, 0.08, 0.001, -0.0015, 0.0])
@@ -289,3 +291,68 @@ def test_a_response_that_is_a_little_wrong_is_noted():
 def test_an_impossible_albedo_is_refused():
     with pytest.raises(FlashGeometryError, match=r"albedo is 1\.2"):
         calibrate_flash(CollectedBoards([], 0), Calibration(), 1.2)
+
+
+LENS_PASSES = np.array([-0.3, 0.06])
+SIZE = (960, 720)
+
+
+def near_pose(rng):
+    """Boards near the camera, into all corners."""
+    z = rng.uniform(0.2, 0.5)
+    turn = cv2.Rodrigues(rng.uniform(-0.6, 0.6, 3))[0]
+    return turn, np.array([rng.uniform(-0.4, 0.4) * z, rng.uniform(-0.3, 0.3) * z, z])
+
+
+def through_the_lens(boards):
+    """The boards as a lens that darkens its corners shows them; squares outside the picture are gone."""
+    seen = []
+    for board in boards:
+        off = project(LENS, board.points_cam) - np.array(SIZE) / 2
+        r2 = (off**2).sum(1) / (SIZE[0] ** 2 + SIZE[1] ** 2) * 4
+        inside = (np.abs(off) < np.array(SIZE) / 2).all(1)
+        passed = 1 + LENS_PASSES[0] * r2 + LENS_PASSES[1] * r2**2
+        if inside.sum() >= 8:
+            seen.append(replace(board, radiance=board.radiance * passed[:, None]).part(inside))
+    return seen
+
+
+def flash_at(*place):
+    truth = TRUTH.copy()
+    truth[:3] = place
+    return truth
+
+
+def test_lens_and_beam_are_told_apart_where_the_flash_is_beside_the_lens():
+    truth = flash_at(0.15, -0.05, 0.01)
+    rng = np.random.default_rng(8)
+    off, joint = [], []
+    for _ in range(12):
+        found = fit_lens_falloff(through_the_lens(make_boards(rng, 14, truth, near_pose)), LENS, SIZE)
+        passed, sigma = found.corner
+        off.append((passed - 1 - LENS_PASSES.sum()) / sigma)
+        joint.append(sigma)
+    # A root mean square of twelve is known to a fifth; the prior and Student's t make the claim larger.
+    assert 0.3 < np.sqrt(np.mean(np.square(off))) < 1.6
+    assert np.median(joint) < 0.015
+    assert found.reach > 0.8
+
+
+def test_a_flash_is_where_it_is_when_the_lens_is_found_with_it():
+    truth = flash_at(0.15, -0.05, 0.01)
+    boards = through_the_lens(make_boards(np.random.default_rng(9), 14, truth, near_pose))
+    intrinsics = Intrinsics(*SIZE, Quantity.of(LENS[:4], "px", "truth"), Quantity.of(LENS[4:], "1", "truth"))
+    flat = find_flat(CollectedBoards(boards, len(boards)), intrinsics)
+    joint = flat.found.covariance[:LIGHT_SIZE, :LIGHT_SIZE]
+    known = Calibration(intrinsics=intrinsics, flat_field=flat.entry("boards", UNKNOWN))
+    found = calibrate_flash(flat.evened, known, joint=joint)
+    sigma = np.sqrt(np.diag(found.fit.covariance))
+    assert (np.abs(found.fit.light.vector - truth) < 4 * sigma).all()
+    assert sigma[5] > np.sqrt(np.diag(fitted(flat.evened.boards)[0].covariance))[5]  # the lens's share
+    assert "from the flash's light" in known.flat_field.source
+
+
+def test_a_flash_at_the_lens_does_not_tell_the_lens():
+    boards = through_the_lens(make_boards(np.random.default_rng(10), 14, flash_at(0.008, 0, 0), near_pose))
+    with pytest.raises(FlatFieldError, match="do not tell the lens's fall-off"):
+        fit_lens_falloff(boards, LENS, SIZE)

@@ -5,6 +5,7 @@ out in plain vectors; then come blur, shot and read noise, and eight bits of sRG
 """
 
 import json
+import re
 from dataclasses import dataclass, replace
 
 import cv2
@@ -233,6 +234,22 @@ def test_without_a_flat_field_the_falloff_is_named_as_holding_the_lens_too(tmp_p
     assert found.value("flash_falloff") > RIG.falloff + 0.3
     # Stated for albedo 0.8, the strength is a quarter higher; some percent go with the vignetting.
     assert found.value("flash_strength") == pytest.approx(np.array(RIG.strength) / 0.8, rel=0.08)
+
+
+def test_a_flat_field_comes_from_the_flash_s_own_light_where_none_is_known(tmp_path, pairs, capsys):
+    folder = folder_of(pairs, tmp_path)
+    out = tmp_path / "out.json"
+    assert command(folder, "--out", out, "--flat") != 0
+    assert "has a flat field already" in capsys.readouterr().err
+    save_calibration(known_camera(flat=False), folder / "bare.json")
+    flags = ["--board", str(folder / "board.json"), "--calibration", str(folder / "bare.json")]
+    assert main(["calibrate", "flash", str(folder), *flags, "--flat", "--out", str(out)]) == 0
+    found = re.search(r"passes (\S+) ± (\S+) in the corner", capsys.readouterr().out)
+    passed, sigma = float(found[1]), float(found[2])
+    assert abs(passed - 1 - sum(RIG.vignetting)) < 4 * sigma < 0.12
+    known = load_calibration(out)
+    assert known.flat_field.value.sum() == pytest.approx(passed - 1, abs=1e-3)
+    assert abs(known.flash_falloff.value - RIG.falloff) < 4 * known.flash_falloff.sigma
 
 
 def test_the_light_of_a_square_is_that_of_the_simulator(photograph):
