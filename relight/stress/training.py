@@ -34,7 +34,7 @@ _CONFIG = PaperConfig(crop=32)
 
 def cases() -> Iterator[Case]:
     """All cases of this module."""
-    for stressed, scene in _SCENES.items():
+    for stressed, scene in SCENES.items():
         yield Case(PAPER, stressed, partial(_fitted, scene, 600, _CONFIG, _STEPS), _ALL)
     yield Case(PAPER, "one point", partial(_fitted, film, 1, _CONFIG, _STEPS), _ALL)
     for times in (10.0, 1000.0):
@@ -44,7 +44,7 @@ def cases() -> Iterator[Case]:
         yield Case(PAPER, f"rates {times:g} times too high", fitted, _ALL)
 
 
-_SCENES: dict[str, Callable[[], Scene]] = {
+SCENES: dict[str, Callable[[], Scene]] = {
     "usual capture": film,
     "black": partial(film, Subject(albedo=0.0)),
     "black jacket": partial(film, Subject(jacket=0.0)),
@@ -62,6 +62,7 @@ _SCENES: dict[str, Callable[[], Scene]] = {
     "a camera a millimetre from the surface": captures.from_the_skin,
     "a camera that looks away": captures.looking_away,
 }
+"""What a neural fit has to live through, by name."""
 
 
 def _fitted(
