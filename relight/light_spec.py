@@ -3,10 +3,13 @@
 A spec is `kind`, `kind:value` or `kind:value;key=value;...`, and several of them joined by `+`:
 
     captured   room   flash   room+flash
-    directional:0,0,1;ambient=0.5;color=1,1,1;shadows=on
-    point:0.5,0.3,0.8;color=1,.8,.6
+    directional:0,0,1;ambient=0.5;color=1,1,1;shadows=on;angle=5
+    point:0.5,0.3,0.8;color=1,.8,.6;radius=0.05
     environment:studio.hdr;rotate=90;gain=0.5;method=sh        (or env:)
     sh:coefficients.json;rotate=90;gain=2
+
+A light with a size, `radius` in metres or `angle` in degrees across, has soft shadows; asking for an angle
+asks for the shadows.
 
 Any may end in `;name=NAME`, the light's name in file names; without it the spec itself is made into a name.
 
@@ -206,11 +209,13 @@ def _build(fields: Fields, base: Path) -> Light:
 
 
 def _directional(fields: Fields, base: Path) -> Light:
+    angle_deg = fields.number("angle", 0.0)
     return DirectionalLight(
         to_light=_vector(fields, "to_light"),
         ambient=fields.number("ambient", 0.0),
         color=_vector(fields, "color", (1.0, 1.0, 1.0)),
-        shadows=_switch(fields, "shadows", False),
+        shadows=_switch(fields, "shadows", angle_deg > 0),
+        angle_deg=angle_deg,
     )
 
 
@@ -221,7 +226,12 @@ def _point(fields: Fields, base: Path) -> Light:
     strength = _vector(fields, given[0]) if given else (1.0, 1.0, 1.0)
     if given == ["intensity"]:
         strength = (strength[0] / math.pi, strength[1] / math.pi, strength[2] / math.pi)
-    return PointLight(_vector(fields, "position"), strength, _switch(fields, "shadows", True))
+    return PointLight(
+        _vector(fields, "position"),
+        strength,
+        _switch(fields, "shadows", True),
+        fields.number("radius", 0.0),
+    )
 
 
 def _environment(fields: Fields, base: Path) -> Light:
@@ -259,10 +269,13 @@ _KINDS = {
     "room": _Kind(lambda fields, base: RoomLight()),
     "flash": _Kind(lambda fields, base: FlashLight()),
     "directional": _Kind(
-        _directional, "to_light", ("ambient", "color", "shadows"), "directional:0,0,1;ambient=0.5"
+        _directional, "to_light", ("ambient", "color", "shadows", "angle"), "directional:0,0,1;ambient=0.5"
     ),
     "point": _Kind(
-        _point, "position", ("C", "color", "intensity", "shadows"), "point:0.5,0.3,0.8;color=1,.8,.6"
+        _point,
+        "position",
+        ("C", "color", "intensity", "shadows", "radius"),
+        "point:0.5,0.3,0.8;color=1,.8,.6",
     ),
     "environment": _Kind(
         _environment, "map", ("rotate", "gain", "method", "shadows"), "environment:studio.hdr;rotate=90"

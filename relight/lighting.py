@@ -12,6 +12,11 @@ unit direction from a point to a light, V in 0..1 is how much of a light a point
     environment   A / pi E(n)                                        E the irradiance of a panorama
     sh            A / pi max(0, [n 1] M [n 1]^T)
 
+A light that casts shadows also bounces: what arrives by way of other parts of the subject is added to the
+term that A multiplies, and A is then that without the bounce of the capture's own flash
+(`relight.interreflection`). With a reflectance point lights and environments have its gloss and its
+retro-reflection too.
+
 The flash casts no shadow: what it does not reach is hidden from the camera beside it (paper, eq. 4). Where
 the normal is zero all terms with n are zero, and the room's and the ambient term remain; `surface` says what
 else happens at the edges.
@@ -33,6 +38,7 @@ from torch import Tensor
 
 from relight.environment import DiffuseIrradiance, cluster_lights
 from relight.panorama import panorama_to_sh, read_panorama
+from relight.prefiltering import GlossyEnvironment, even_light
 from relight.spherical_harmonics import (
     bands_of,
     irradiance_matrix,
@@ -48,6 +54,8 @@ if TYPE_CHECKING:
     from relight.reflectance import Reflectance
 
 Vector = tuple[float, float, float]
+
+_WIDEST_DEG = 120.0  # of a distant disc of light: what is wider is an environment
 
 
 def shade(
@@ -75,7 +83,8 @@ def shade(
             flash.
         flash: flag F of a captured light; by default the camera's own, and 0 where that is unknown.
         visibility: for shadows; without it nothing is in shadow.
-        reflectance: of the subject, for the flash and point lights; by default it is Lambertian.
+        reflectance: of the subject, for the flash, point lights and environments; by default it is
+            Lambertian.
 
     Returns:
         [..., 3], linear, not premultiplied, 0 where the mask is 0; float32 or float64 as the maps.
@@ -123,17 +132,23 @@ class CaptureLight:
             position = position + surface.vector(self.flash_offset_cam_m) @ cam_from_world
         return surface.vector(self.c_flash) * self.response(surface, position)
 
-    def response(self, surface: Surface, position: Tensor) -> Tensor:
-        """Radiance [P, 3] under a point light of unit colour at [3], without shadows."""
-        falloff = cosine_falloff(surface.points, surface.normals, position)[:, None]
+    def response(self, surface: Surface, position: Tensor, albedo: Tensor | None = None) -> Tensor:
+        """Radiance [P, 3] under a point light of unit colour at [3], without shadows.
+
+        The albedo [P, 3] is the surface's where no other is given.
+        """
+        albedo = surface.albedo if albedo is None else albedo
         if self.reflectance is None or self.camera is None:
-            return surface.albedo * falloff
+            return albedo * cosine_falloff(surface.points, surface.normals, position)[:, None]
         to_light, distance = direction_to(surface.points, position)
-        to_view, _ = direction_to(surface.points, surface.vector(self.camera.centre_world))
-        response = self.reflectance.response(
-            surface.albedo, surface.normals, to_light, to_view, surface.gloss
-        )
+        to_view = self.to_view(surface)
+        response = self.reflectance.response(albedo, surface.normals, to_light, to_view, surface.gloss)
         return response / distance.clamp(min=MIN_DISTANCE_M) ** 2
+
+    def to_view(self, surface: Surface) -> Tensor:
+        """Unit directions [P, 3] from the points to the camera; only where there is one."""
+        assert self.camera is not None
+        return direction_to(surface.points, surface.vector(self.camera.centre_world))[0]
 
 
 class Light(ABC):
@@ -182,12 +197,14 @@ class DirectionalLight(Light):
         color: [3], radiance of a white surface that faces the light.
         shadows: whether a visibility casts shadows. Off, as in the paper's formula; the ambient share has
             none.
+        angle_deg: across the light, as seen from the subject: the sun's is 0.53. Above 0 shadows are soft.
     """
 
     to_light: Vector
     ambient: float = 0.0
     color: Vector = (1.0, 1.0, 1.0)
     shadows: bool = False
+    angle_deg: float = 0.0
 
     def __post_init__(self) -> None:
         length = math.hypot(*self.to_light)
@@ -195,14 +212,24 @@ class DirectionalLight(Light):
             raise ValueError(f"to_light is {self.to_light}; it must be a direction of finite length above 0")
         if not 0.0 <= self.ambient <= 1.0:
             raise ValueError(f"ambient is {self.ambient}; it must lie in 0..1")
+        if not 0.0 <= self.angle_deg <= _WIDEST_DEG:
+            raise ValueError(f"angle is {self.angle_deg}; it must lie in 0..{_WIDEST_DEG:g} degrees")
 
     def radiance(self, surface: Surface, capture: CaptureLight) -> Tensor:  # noqa: D102
+        arriving: Tensor = self.ambient + (1.0 - self.ambient) * self._direct(surface)
+        albedo = surface.albedo
+        if self.shadows:
+            arriving = arriving + (1.0 - self.ambient) * surface.indirect(self, self._direct)
+            albedo = surface.bare_albedo
+        return albedo * surface.vector(self.color) * arriving
+
+    def _direct(self, surface: Surface) -> Tensor:
+        """V max(0, <n, l>), [P, 3]."""
         to_light = surface.vector(np.divide(self.to_light, math.hypot(*self.to_light)))
         direct = cosine(surface.normals, to_light)
         if self.shadows:
-            direct = direct * surface.sees_direction(to_light)
-        share = self.ambient + (1.0 - self.ambient) * direct
-        return surface.albedo * surface.vector(self.color) * share[:, None]
+            direct = direct * surface.sees_direction(to_light, math.radians(self.angle_deg))
+        return direct[:, None].expand(-1, 3)
 
 
 @dataclass(frozen=True)
@@ -213,19 +240,35 @@ class PointLight(Light):
         position: [3], metres, world.
         C: [3], intensity / pi: the radiance of a white surface that faces the light from one metre.
         shadows: whether a visibility casts shadows.
+        radius: of the light, metres. Above 0 shadows are soft.
     """
 
     position: Vector
     C: Vector = (1.0, 1.0, 1.0)
     shadows: bool = True
+    radius: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.radius < math.inf:
+            raise ValueError(f"radius is {self.radius}; it must be finite and at least 0")
 
     def radiance(self, surface: Surface, capture: CaptureLight) -> Tensor:  # noqa: D102
         position = surface.vector(self.position)
-        radiance = surface.vector(self.C) * capture.response(surface, position)
-        if self.shadows:
-            visible = surface.sees_point(position)
-            radiance = radiance * (visible[:, None] if isinstance(visible, Tensor) else visible)
-        return radiance
+        if not self.shadows:
+            return surface.vector(self.C) * capture.response(surface, position)
+        albedo = surface.bare_albedo
+        direct = capture.response(surface, position, albedo) * self._visible(surface, position)
+        return surface.vector(self.C) * direct + albedo * surface.indirect(self, self._direct)
+
+    def _direct(self, surface: Surface) -> Tensor:
+        """C / d^2 V max(0, <n, l>), [P, 3]."""
+        position = surface.vector(self.position)
+        falloff = cosine_falloff(surface.points, surface.normals, position)[:, None]
+        return surface.vector(self.C) * falloff * self._visible(surface, position)
+
+    def _visible(self, surface: Surface, position: Tensor) -> Tensor | float:
+        visible = surface.sees_point(position, self.radius)
+        return visible[:, None] if isinstance(visible, Tensor) else visible
 
 
 @dataclass(frozen=True, eq=False)
@@ -288,24 +331,67 @@ class EnvironmentLight(Light):
         return cls(read_panorama(path), **options)
 
     def radiance(self, surface: Surface, capture: CaptureLight) -> Tensor:  # noqa: D102
-        world_from_panorama = surface.vector(rotation_about_up(self.rotate_deg))
-        normals = surface.normals @ world_from_panorama  # as rows: panorama_from_world @ n
         if self.method == "sh":
+            normals = surface.normals @ self._world_from_panorama(surface)
             irradiance = _lit_side(quadratic_irradiance(surface.vector(self._matrix), normals), normals)
-        else:
-            irradiance = self._irradiance(normals)
-            if self.shadows:
-                # A share of few lights times the exact integral: without any shadow it is exactly one, so few
-                # cost no accuracy there (Heitz 2018, "Combining analytic direct illumination and stochastic
-                # shadows").
-                directions, irradiances = (surface.vector(part) for part in self._lights)
-                directions = directions @ world_from_panorama.T
-                irradiance = irradiance * surface.environment_share(directions, irradiances)
-        return surface.albedo * (self.gain / math.pi) * irradiance
+            return surface.albedo * (self.gain / math.pi) * irradiance
+        share = self._share(surface) if self.shadows else 1.0
+        direct = self._unshadowed(surface) * share
+        gloss: Tensor | float = 0.0
+        if capture.reflectance is not None and capture.camera is not None:
+            diffuse, gloss = self._reflected(surface, capture.reflectance, capture.to_view(surface))
+            direct = direct * diffuse
+            # Where the sky is hidden from the normal's side it is, on the whole, from the mirror's too.
+            gloss = gloss * share
+        if not self.shadows:
+            return surface.albedo * direct + gloss
+        return surface.bare_albedo * (direct + surface.indirect(self, self._direct)) + gloss
+
+    def _direct(self, surface: Surface) -> Tensor:
+        """Radiance of a white surface [P, 3], with shadows."""
+        return self._unshadowed(surface) * self._share(surface)
+
+    def _unshadowed(self, surface: Surface) -> Tensor:
+        """E(n) / pi, [P, 3]."""
+        normals = surface.normals @ self._world_from_panorama(surface)
+        return (self.gain / math.pi) * self._irradiance(normals)
+
+    def _share(self, surface: Surface) -> Tensor | float:
+        """What of the irradiance arrives, [P, 3].
+
+        A share of few lights times the exact integral: without any shadow it is exactly one, so few cost no
+        accuracy there (Heitz 2018, "Combining analytic direct illumination and stochastic shadows").
+        """
+        directions, irradiances = (surface.vector(part) for part in self._lights)
+        return surface.environment_share(directions @ self._world_from_panorama(surface).T, irradiances)
+
+    def _reflected(
+        self, surface: Surface, reflectance: Reflectance, to_view: Tensor
+    ) -> tuple[Tensor, Tensor | float]:
+        """Factor [P, 1] on the diffuse part, and radiance [P, 3] of the gloss, of the whole panorama."""
+        view = (surface.normals * to_view).sum(dim=-1, keepdim=True)
+        diffuse, gloss = even_light(reflectance, view[:, 0])
+        if reflectance.f0 <= 0:
+            return diffuse[:, None], 0.0
+        if reflectance.alpha not in self._blurred:
+            self._blurred[reflectance.alpha] = GlossyEnvironment.of_panorama(self.panorama, reflectance.alpha)
+        mirrored = 2.0 * view * surface.normals - to_view
+        mean = self._blurred[reflectance.alpha](mirrored @ self._world_from_panorama(surface))
+        gloss = gloss * (surface.normals != 0).any(dim=-1)
+        factor = 1.0 if surface.gloss is None else surface.gloss
+        return diffuse[:, None], self.gain * mean * gloss[:, None] * factor
+
+    def _world_from_panorama(self, surface: Surface) -> Tensor:
+        """[3, 3]; directions as rows go into the panorama's axes by `@` this."""
+        return surface.vector(rotation_about_up(self.rotate_deg))
 
     @cached_property
     def _irradiance(self) -> DiffuseIrradiance:
         return DiffuseIrradiance.of_panorama(self.panorama)
+
+    @cached_property
+    def _blurred(self) -> dict[float, GlossyEnvironment]:
+        return {}
 
     @cached_property
     def _matrix(self) -> Tensor:

@@ -7,19 +7,31 @@ so that no light leaks between points and no surface shades itself; the answer i
 cells (Reeves et al. 1987).
 
 For a panorama, which is many distant lights, the question is answered once for every point of the portrait
-and looked up in every view.
+and looked up in every view. So it is for a light with a size, which is taken for as many small lights spread
+evenly over its disc (Cook et al. 1984, "Distributed ray tracing", with fixed places instead of random ones):
+its penumbra is that of the disc for any occluder, which filtering one depth map (Fernando 2005,
+"Percentage-closer soft shadows") has only where a single plane casts it.
+
+What the light leaves dark other parts of the subject light up: `relight.interreflection`.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
 
 import torch
 
+from relight.interreflection import Interreflection, even_directions, spiral
 from relight.maps import Maps
 from relight.portrait import Portrait
+from relight.surface import Surface
+
+if TYPE_CHECKING:
+    from relight.lighting import Light
 
 _CELL = 1.5  # of a depth map, in spacings of the points
 _CELL_MANY = 3.0  # where there are many lights, each counts little
@@ -29,7 +41,12 @@ _STEEPEST = (
     20.0  # tangent: surfaces that the light grazes at more than 87 degrees are dark by their cosine anyway
 )
 _LARGEST_SIDE = 4096  # cells
-_MUTUAL = 0.25  # hollows face parts that are themselves turned away or in shadow
+_SMALL_LIGHTS = 48  # over the disc of a light with a size: steps of a penumbra under two hundredths
+_FLASHES = 16  # directions that stand for those in which a capture's flash was
+
+_Coordinates = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
+Arriving = Callable[[Surface], torch.Tensor]
+"""What a light makes of a white diffuse surface: radiance [S, C]."""
 
 
 class ShadowCaster:
@@ -39,7 +56,8 @@ class ShadowCaster:
         """A caster for a portrait."""
         self.portrait = portrait
         self._maps: dict[tuple[str, tuple[float, ...]], _DepthMap] = {}
-        self._shares: dict[bytes, torch.Tensor] = {}
+        self._shares: dict[bytes | tuple[str | float, ...], torch.Tensor] = {}
+        self._indirect: dict[Light, torch.Tensor] = {}
 
     def of_view(self, maps: Maps) -> ViewVisibility:
         """The visibility of lights from the pixels of a view."""
@@ -47,18 +65,45 @@ class ShadowCaster:
 
     def point(self, position: torch.Tensor) -> _DepthMap:
         """Depth map from a point light at [3]."""
-        return self._cached("point", position, lambda: _from_point(self.portrait, position))
+        return self._cached("point", position, lambda: _from_point(self.portrait, position).map)
 
     def directional(self, to_light: torch.Tensor) -> _DepthMap:
         """Depth map from a distant light in a direction [3]."""
-        return self._cached("distant", to_light, lambda: _from_afar(self.portrait, to_light, _CELL))
+        return self._cached("distant", to_light, lambda: _from_afar(self.portrait, to_light, _CELL).map)
+
+    def sphere(self, position: torch.Tensor, radius: float) -> torch.Tensor:
+        """Share [P] of a ball of light at [3], of a radius in world units, that each of the points sees.
+
+        From the subject a ball is a disc that faces it.
+        """
+        u, v, _ = _frame(self.portrait.points.mean(dim=0) - position.to(self.portrait.points))
+        return self._share_of(
+            ("sphere", *position.tolist(), radius),
+            (
+                _from_point(self.portrait, position.to(u) + radius * (x * u + y * v))
+                for x, y in spiral(_SMALL_LIGHTS).tolist()
+            ),
+        )
+
+    def cone(self, to_light: torch.Tensor, angle_rad: float) -> torch.Tensor:
+        """Share [P] of a distant disc of light about a direction [3], of an angle across, that each point
+        sees."""
+        u, v, w = _frame(to_light.to(self.portrait.points))
+        reach = math.tan(angle_rad / 2.0)
+        return self._share_of(
+            ("cone", *to_light.tolist(), angle_rad),
+            (
+                _from_afar(
+                    self.portrait,
+                    torch.nn.functional.normalize(w + reach * (x * u + y * v), dim=0),
+                    _CELL,
+                )
+                for x, y in spiral(_SMALL_LIGHTS).tolist()
+            ),
+        )
 
     def environment(self, directions: torch.Tensor, irradiances: torch.Tensor) -> torch.Tensor:
         """Share [P, C] of the irradiance of many distant lights that reaches each of the points.
-
-        Light that comes from the subject itself is part of it: from the directions in which a point sees no
-        sky it sees other parts of the subject, taken for of its own albedo and under a share `_MUTUAL` of the
-        mean irradiance. That keeps eye sockets from going black.
 
         Args:
             directions: [K, 3], unit, where the light comes from.
@@ -73,15 +118,40 @@ class ShadowCaster:
                 directions.to(unshadowed), irradiances.to(unshadowed), strict=True
             ):
                 cosine = (portrait.normals_world @ to_light).clamp(min=0.0)
-                depth_map = _from_afar(portrait, to_light, _CELL_MANY)
-                lit = cosine * depth_map.visible(portrait.points, portrait.normals_world, soft=False)
+                lit = cosine * _from_afar(portrait, to_light, _CELL_MANY).visible_points()
                 unshadowed += cosine[:, None] * irradiance
                 arriving += lit[:, None] * irradiance
-            open_sky = arriving.sum(dim=1) / unshadowed.sum(dim=1).clamp(min=1e-12)
-            mutual = _MUTUAL * (1.0 - open_sky) * portrait.albedo.mean(dim=1)
-            arriving += mutual[:, None] * unshadowed.mean(dim=0)
             dark = unshadowed <= 0
             self._shares[key] = torch.where(dark, 1.0, arriving / torch.where(dark, 1.0, unshadowed))
+        return self._shares[key]
+
+    @cached_property
+    def interreflection(self) -> Interreflection:
+        """What the subject's parts see of each other; found when first asked for, in a second or two."""
+        found = Interreflection(self.portrait)
+        surfels = found.points_world, found.normals_world
+        ball = even_directions(_FLASHES).to(self.portrait.points)
+        lit = [
+            (found.normals_world @ to_light).clamp(min=0.0)
+            * _from_afar(self.portrait, to_light, _CELL_MANY).map.visible(*surfels, soft=False)
+            for to_light in ball
+        ]
+        found.take_out_of_albedo(torch.stack(lit))
+        return found
+
+    def indirect(self, light: Light, arriving: Arriving) -> torch.Tensor:
+        """What of a light comes to the surfels from other parts of the subject, [S, C], as the radiance of a
+        white surface."""
+        if light not in self._indirect:
+            surfels = self.interreflection
+            direct = arriving(Surface(surfels, _SurfelVisibility(self, surfels)))
+            self._indirect[light] = surfels.indirect(direct)
+        return self._indirect[light]
+
+    def _share_of(self, key: tuple[str | float, ...], views: Iterable[_LightView]) -> torch.Tensor:
+        """Share [P] of some lights that each of the points sees."""
+        if key not in self._shares:
+            self._shares[key] = torch.stack([view.visible_points() for view in views]).mean(dim=0)
         return self._shares[key]
 
     def _cached(self, kind: str, vector: torch.Tensor, make: Callable[[], _DepthMap]) -> _DepthMap:
@@ -99,20 +169,42 @@ class ViewVisibility:
         self._caster = caster
         self._maps = maps
 
-    def point(self, position_world: torch.Tensor) -> torch.Tensor:
-        """[H, W] 0..1 for a point light at [3]."""
+    def point(self, position_world: torch.Tensor, radius: float = 0.0) -> torch.Tensor:
+        """[H, W] 0..1 for a ball of light at [3], of a radius in world units; 0 = a point."""
+        if radius > 0:
+            return self._looked_up(self._caster.sphere(position_world, radius))
         return self._of_pixels(self._caster.point(position_world))
 
-    def directional(self, to_light: torch.Tensor) -> torch.Tensor:
-        """[H, W] 0..1 for a distant light, unit direction [3]."""
+    def directional(self, to_light: torch.Tensor, angle_rad: float = 0.0) -> torch.Tensor:
+        """[H, W] 0..1 for a distant disc of light, unit direction [3] and angle across; 0 = a point."""
+        if angle_rad > 0:
+            return self._looked_up(self._caster.cone(to_light, angle_rad))
         return self._of_pixels(self._caster.directional(to_light))
 
     def environment(self, directions: torch.Tensor, irradiances: torch.Tensor) -> torch.Tensor:
         """[H, W, C] share of the irradiance [K, C] of distant lights [K, 3]; 1 off the subject."""
-        share = self._caster.environment(directions, irradiances)
+        return self._looked_up(self._caster.environment(directions, irradiances))
+
+    def indirect(self, light: Light, arriving: Arriving) -> torch.Tensor:
+        """[H, W, C] of a light by way of other parts of the subject; 0 off the subject."""
+        return self._of_surfels(self._caster.indirect(light, arriving))
+
+    @cached_property
+    def albedo_excess(self) -> torch.Tensor:
+        """[H, W, 3], see `Interreflection.excess`; 0 off the subject."""
+        return self._of_surfels(self._caster.interreflection.excess)
+
+    def _of_surfels(self, values: torch.Tensor) -> torch.Tensor:
+        on = self._maps.point_ids >= 0
+        result = values.new_zeros(*on.shape, values.shape[1])
+        result[on] = self._caster.interreflection.of_points(values, self._maps.point_ids[on])
+        return result
+
+    def _looked_up(self, share: torch.Tensor) -> torch.Tensor:
+        """Shares [P, ...] of the points in the pixels [H, W, ...]; 1 off the subject."""
         ids = self._maps.point_ids
         on = ids >= 0
-        result = share.new_ones(*ids.shape, share.shape[1])
+        result = share.new_ones(*ids.shape, *share.shape[1:])
         result[on] = share[ids[on]]
         return result
 
@@ -121,6 +213,36 @@ class ViewVisibility:
         visible = torch.ones_like(self._maps.mask)
         visible[on] = depth_map.visible(self._maps.points_world[on], self._maps.normals_world[on])
         return visible
+
+
+class _SurfelVisibility:
+    """How much of a light each surfel sees; light that comes by way of others is not asked for there."""
+
+    def __init__(self, caster: ShadowCaster, surfels: Interreflection) -> None:
+        self._caster, self._surfels = caster, surfels
+
+    def point(self, position_world: torch.Tensor, radius: float = 0.0) -> torch.Tensor:
+        if radius > 0:
+            return self._caster.sphere(position_world, radius)[self._surfels.ids]
+        return self._seen(self._caster.point(position_world))
+
+    def directional(self, to_light: torch.Tensor, angle_rad: float = 0.0) -> torch.Tensor:
+        if angle_rad > 0:
+            return self._caster.cone(to_light, angle_rad)[self._surfels.ids]
+        return self._seen(self._caster.directional(to_light))
+
+    def environment(self, directions: torch.Tensor, irradiances: torch.Tensor) -> torch.Tensor:
+        return self._caster.environment(directions, irradiances)[self._surfels.ids]
+
+    def indirect(self, light: Light, arriving: Arriving) -> None:
+        return None
+
+    @property
+    def albedo_excess(self) -> None:
+        return None
+
+    def _seen(self, depth_map: _DepthMap) -> torch.Tensor:
+        return depth_map.visible(self._surfels.points_world, self._surfels.normals_world)
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,7 +269,11 @@ class _DepthMap:
 
     def visible(self, points: torch.Tensor, normals: torch.Tensor, soft: bool = True) -> torch.Tensor:
         """[P] 0..1 for points [P, 3] with unit normals [P, 3]; `soft` interpolates between four cells."""
-        grid, depth, towards = _coordinates(points, self.axes, self.position)
+        return self.visible_at(_coordinates(points, self.axes, self.position), normals, soft)
+
+    def visible_at(self, coordinates: _Coordinates, normals: torch.Tensor, soft: bool) -> torch.Tensor:
+        """The same, for points whose coordinates from the light are known."""
+        grid, depth, towards = coordinates
         cosine = (normals * towards).sum(dim=1)
         slope = (1.0 - cosine**2).clamp(min=0.0).sqrt() / cosine.clamp(min=1.0 / _STEEPEST)
         limit = depth - self.bias - _SLANT * self.cell_size * slope.clamp(max=_STEEPEST)
@@ -157,7 +283,7 @@ class _DepthMap:
 
         def lit(column: torch.Tensor, row: torch.Tensor) -> torch.Tensor:
             place = row.clamp(0, rows - 1) * columns + column.clamp(0, columns - 1)
-            return (limit <= flat[place]).to(points)
+            return (limit <= flat[place]).to(depth)
 
         if not soft:
             whole = at.floor().long()
@@ -170,7 +296,20 @@ class _DepthMap:
         return (1 - y) * upper + y * lower
 
 
-def _from_point(portrait: Portrait, position: torch.Tensor) -> _DepthMap:
+@dataclass(frozen=True, eq=False)
+class _LightView:
+    """A portrait from a light: the depth map, and where its points are in it."""
+
+    map: _DepthMap
+    coordinates: _Coordinates
+    normals: torch.Tensor
+
+    def visible_points(self) -> torch.Tensor:
+        """[P] 0 or 1, whether each point of the portrait sees the light."""
+        return self.map.visible_at(self.coordinates, self.normals, soft=False)
+
+
+def _from_point(portrait: Portrait, position: torch.Tensor) -> _LightView:
     position = position.to(portrait.points)
     centre = portrait.points.mean(dim=0)
     axis = centre - position
@@ -181,15 +320,16 @@ def _from_point(portrait: Portrait, position: torch.Tensor) -> _DepthMap:
     return _build(portrait, _frame(axis), position, cell, _CELL * portrait.spacing)
 
 
-def _from_afar(portrait: Portrait, to_light: torch.Tensor, cell: float) -> _DepthMap:
+def _from_afar(portrait: Portrait, to_light: torch.Tensor, cell: float) -> _LightView:
     size = cell * portrait.spacing
     return _build(portrait, _frame(-to_light.to(portrait.points)), None, size, size)
 
 
 def _build(
     portrait: Portrait, axes: torch.Tensor, position: torch.Tensor | None, cell: float, cell_size: float
-) -> _DepthMap:
-    grid, depth, _ = _coordinates(portrait.points, axes, position)
+) -> _LightView:
+    coordinates = _coordinates(portrait.points, axes, position)
+    grid, depth, _ = coordinates
     low, high = grid.min(dim=0).values, grid.max(dim=0).values
     cell = max(cell, float((high - low).max()) / _LARGEST_SIDE)
     low = low - 1.5 * cell
@@ -200,12 +340,11 @@ def _build(
     nearest = nearest.view(1, 1, rows, columns)
     around = -torch.nn.functional.max_pool2d(-nearest, 3, 1, 1)
     nearest = torch.where(torch.isinf(nearest), around, nearest)[0, 0]
-    return _DepthMap(axes, position, low, cell, nearest, cell_size, _BIAS * portrait.spacing)
+    depth_map = _DepthMap(axes, position, low, cell, nearest, cell_size, _BIAS * portrait.spacing)
+    return _LightView(depth_map, coordinates, portrait.normals_world)
 
 
-def _coordinates(
-    points: torch.Tensor, axes: torch.Tensor, position: torch.Tensor | None
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+def _coordinates(points: torch.Tensor, axes: torch.Tensor, position: torch.Tensor | None) -> _Coordinates:
     """Grid coordinates [P, 2], depth [P] and unit directions to the light [P, 3] or [1, 3].
 
     The grid of a distant light is the plane across its rays; that of a point light is azimuthal equidistant

@@ -7,13 +7,17 @@ gradients are finite even at d = 0. NaN stays in its own point.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cached_property
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
+
+if TYPE_CHECKING:
+    from relight.lighting import Light
 
 # Nearer than this, a light counts as this far: no real lamp is a point, and 1/d^2 would have no bound.
 MIN_DISTANCE_M = 1e-3
@@ -51,17 +55,28 @@ class SurfaceMaps(Protocol):
 class Visibility(Protocol):
     """How much of a light each pixel of the maps sees, 0..1, from the geometry."""
 
-    def point(self, position_world: Tensor) -> Tensor:
-        """[...] for a light at a position [3], metres."""
+    def point(self, position_world: Tensor, radius: float = 0.0) -> Tensor:
+        """[...] for a ball of light about a position [3], metres."""
 
-    def directional(self, to_light: Tensor) -> Tensor:
-        """[...] for a distant light, unit direction [3]."""
+    def directional(self, to_light: Tensor, angle_rad: float = 0.0) -> Tensor:
+        """[...] for a distant disc of light about a unit direction [3], of an angle across."""
 
     def environment(self, directions: Tensor, irradiances: Tensor) -> Tensor | None:
         """[..., C], of all that K distant lights would give without shadows.
 
         Unit directions [K, 3] and irradiances at normal incidence [K, C]; None where that is not offered.
         """
+
+    def indirect(self, light: Light, arriving: Callable[[Surface], Tensor]) -> Tensor | None:
+        """[..., C], what comes of a light by way of other parts of the subject, as white radiance.
+
+        `arriving` is what comes from the light itself, to any surface; None where that is not offered.
+        """
+
+    @property
+    def albedo_excess(self) -> Tensor | None:
+        """[..., C], share by which the albedo holds light that bounced under the capture's flash; with
+        `indirect`."""
 
 
 class Surface:
@@ -117,17 +132,18 @@ class Surface:
         """A value as a tensor of the surface's type, on its device."""
         return (value if isinstance(value, Tensor) else torch.tensor(np.asarray(value))).to(self._maps.albedo)
 
-    def sees_point(self, position_world: Tensor) -> Tensor | float:
-        """[P], how much of a point light is seen; 1 without a visibility."""
+    def sees_point(self, position_world: Tensor, radius: float = 0.0) -> Tensor | float:
+        """[P], how much of a point light, or of a ball of light, is seen; 1 without a visibility."""
         if self._visibility is None:
             return 1.0
-        return self._gather_visible(self._visibility.point(position_world)[None])[0]
+        return self._gather_visible(self._visibility.point(position_world, radius)[None])[0]
 
-    def sees_direction(self, to_light: Tensor) -> Tensor | float:
-        """[P], how much of a distant light is seen; 1 without a visibility."""
+    def sees_direction(self, to_light: Tensor, angle_rad: float = 0.0) -> Tensor | float:
+        """[P], how much of a distant light, or of a disc of an angle across, is seen; 1 without a
+        visibility."""
         if self._visibility is None:
             return 1.0
-        return self._gather_visible(self._visibility.directional(to_light)[None])[0]
+        return self._gather_visible(self._visibility.directional(to_light, angle_rad)[None])[0]
 
     def environment_share(self, directions: Tensor, irradiances: Tensor) -> Tensor | float:
         """[P, C], share of the irradiance of distant lights that arrives; 1 where that is not offered."""
@@ -135,6 +151,17 @@ class Surface:
             return 1.0
         share = self._visibility.environment(directions, irradiances)
         return 1.0 if share is None else self._gather(share.to(self._maps.albedo))
+
+    def indirect(self, light: Light, arriving: Callable[[Surface], Tensor]) -> Tensor | float:
+        """[P, C], what comes of a light by way of other parts of the subject; 0 where that is not offered."""
+        indirect = None if self._visibility is None else self._visibility.indirect(light, arriving)
+        return 0.0 if indirect is None else self._gather(indirect.to(self._maps.albedo))
+
+    @cached_property
+    def bare_albedo(self) -> Tensor:
+        """[P, 3], the albedo to go with `indirect`: without the bounce of the capture's flash."""
+        excess = None if self._visibility is None else self._visibility.albedo_excess
+        return self.albedo if excess is None else self.albedo / (1.0 + self._gather(excess.to(self.albedo)))
 
     def scatter(self, values: Tensor) -> Tensor:
         """Values [P, C] of the points back in the maps' shape, [..., C], 0 elsewhere."""

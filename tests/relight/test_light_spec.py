@@ -72,6 +72,17 @@ def test_strength_of_a_point_light_is_c_color_or_intensity():
         parse_light("point:1,2,3;C=1,1,1;color=1,1,1")
 
 
+def test_lights_with_a_size_cast_soft_shadows():
+    assert parse_light("point:1,2,3;radius=0.05")[1] == PointLight((1, 2, 3), radius=0.05)
+    _, sun = parse_light("directional:0,0,1;angle=5")
+    assert sun == DirectionalLight((0, 0, 1), shadows=True, angle_deg=5.0)
+    assert not parse_light("directional:0,0,1;angle=5;shadows=off")[1].shadows
+    with pytest.raises(LightError, match="radius is -1"):
+        parse_light("point:1,2,3;radius=-1")
+    with pytest.raises(LightError, match="angle is 200"):
+        parse_light("directional:0,0,1;angle=200")
+
+
 def test_environment_with_its_options(folder):
     _, light = parse_light("env:studio.exr;rotate=90;gain=2;method=sh;shadows=off", folder)
     assert isinstance(light, EnvironmentLight)

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 import torch
+from analytic_scene import looking_at
 
 from capture.cameras import Camera
 from relight.environment import DiffuseIrradiance
@@ -20,7 +21,8 @@ from relight.lighting import (
     SphericalHarmonicsLight,
     shade,
 )
-from relight.panorama import panorama_to_sh
+from relight.panorama import lat_long_directions, lat_long_solid_angles, panorama_to_sh
+from relight.reflectance import Reflectance
 from relight.spherical_harmonics import rotation_about_up, sh_irradiance
 from relight.surface import MIN_DISTANCE_M
 
@@ -112,11 +114,11 @@ class HalfVisible:
         self.has_environment = has_environment
         self.asked = []
 
-    def point(self, position_world):
+    def point(self, position_world, radius=0.0):
         self.asked.append(position_world)
         return self.half
 
-    def directional(self, to_light):
+    def directional(self, to_light, angle_rad=0.0):
         self.asked.append(to_light)
         return self.half
 
@@ -124,6 +126,13 @@ class HalfVisible:
         self.asked.append(directions)
         channels = irradiances.shape[1]
         return self.half[..., None].expand(*self.half.shape, channels) if self.has_environment else None
+
+    def indirect(self, light, arriving):
+        return None
+
+    @property
+    def albedo_excess(self):
+        return None
 
 
 def panorama():
@@ -452,3 +461,51 @@ def test_missing_colours_and_wrong_values_are_refused():
         EnvironmentLight(np.ones((4, 8)))
     with pytest.raises(ValueError, match="5 coefficients"):
         SphericalHarmonicsLight(torch.zeros(5, 3))
+
+
+def test_an_environment_shows_the_reflectance_s_gloss():
+    image = panorama()
+    reflectance = Reflectance(retro=0.5, alpha=0.25, f0=0.04)
+    maps = one_point((0.0, 0.0, 1.0), albedo=0.0)
+    camera = looking_at(np.array([0.0, 0.0, 1.0]), np.zeros(3))
+    light = EnvironmentLight(image, gain=2.0)
+    glossy = shade(light, maps, camera=camera, reflectance=reflectance)
+    to_light = torch.from_numpy(lat_long_directions(*image.shape[:2])).view(-1, 3)
+    weight = np.repeat(lat_long_solid_angles(*image.shape[:2]), image.shape[1])[:, None]
+    normal = torch.tensor([[0.0, 0.0, 1.0]], dtype=DOUBLE)
+    response = reflectance.response(torch.zeros(1, 3, dtype=DOUBLE), normal, to_light, normal)
+    expected = 2.0 / math.pi * (response.numpy() * weight * image.reshape(-1, 3)).sum(axis=0)
+    # The lobe's masking and Fresnel are left out where the panorama is blurred by it: some hundredths.
+    np.testing.assert_allclose(glossy[0], expected, rtol=0.06)
+    # Without a camera there is no view to mirror.
+    np.testing.assert_array_equal(shade(light, maps, reflectance=reflectance), 0.0)
+
+
+def test_light_from_other_parts_is_added_and_the_flash_s_bounce_taken_off():
+    class Bounced(HalfVisible):
+        def indirect(self, light, arriving):
+            return torch.full((1, 3), 0.25, dtype=DOUBLE)
+
+        @property
+        def albedo_excess(self):
+            return torch.full((1, 3), 0.6, dtype=DOUBLE)
+
+    maps = one_point((0.0, 0.0, 1.0), albedo=0.8)  # 0.5 of it without the excess
+    lamp = PointLight((0.0, 0.0, 1.0), C=(2.0, 2.0, 2.0))
+    radiance = shade(lamp, maps, visibility=Bounced((1,)))
+    np.testing.assert_allclose(radiance, 0.5 * (2.0 * 0.5 + 0.25), rtol=1e-6)
+    sun = DirectionalLight((0.0, 0.0, 1.0), ambient=0.2, shadows=True)
+    radiance = shade(sun, maps, visibility=Bounced((1,)))
+    np.testing.assert_allclose(radiance, 0.5 * (0.2 + 0.8 * (0.5 + 0.25)), rtol=1e-6)
+    # The paper's directional light has no shadows, and no bounce.
+    radiance = shade(replace(sun, shadows=False), maps, visibility=Bounced((1,)))
+    np.testing.assert_allclose(radiance, 0.8 * (0.2 + 0.8), rtol=1e-6)
+
+
+def test_lights_of_no_possible_size_are_refused():
+    for radius in (-0.1, math.inf, math.nan):
+        with pytest.raises(ValueError, match="radius"):
+            PointLight((0, 0, 1), radius=radius)
+    for angle in (-1.0, 150.0, math.nan):
+        with pytest.raises(ValueError, match="angle"):
+            DirectionalLight((0, 0, 1), angle_deg=angle)

@@ -223,7 +223,8 @@ def test_shadows_fall_and_can_be_turned_off(ball_over_floor, light, area_px):
     shaded = (shadowed["light"] < 0.5 * plain["light"]).all(dim=-1)
     assert 0.4 * area_px < shaded.sum() < 1.2 * area_px
     lit = (plain["light"] > 0).all(dim=-1) & ~shaded
-    assert (shadowed["light"][lit] > 0.99 * plain["light"][lit]).float().mean() > 0.9  # the rest is penumbra
+    # What the capture's flash bounced is taken out of the albedo near the ball; the rest is penumbra.
+    assert (shadowed["light"][lit] > 0.95 * plain["light"][lit]).float().mean() > 0.9
 
 
 def test_captured_lights_cast_no_shadows(ball_over_floor):
