@@ -33,6 +33,20 @@ STRAIGHT_PX = 0.1
 FEWEST_UNLIT = 12
 """Unlit frames that a dark room, or a short time, leaves: every part of the head is in several of them."""
 
+_CALIBRATED = {
+    "intrinsics": "lens",
+    "response": "response",
+    "dark": "dark level",
+    "noise_read": "noise",
+    "flat_field": "flat field",
+    "colour": "colour",
+    "flash_offset_cam_m": "the flash's place",
+    "flash_axis": "its beam",
+    "flash_falloff": "its beam",
+    "flash_strength": "its strength",
+}
+"""Entries of a calibration that a fit uses, in words."""
+
 Narrowing = tuple[Decision, dict[int, str]]
 """A decision that leaves frames out, and why each of them is."""
 
@@ -93,6 +107,7 @@ def make_plan(
             found.cloud,
             found.masks,
             found.scale,
+            _calibration(session),
             views,
             _undistortion(poses, forced),
             _normals(cloud),
@@ -160,6 +175,18 @@ def _flash(frames: list[FrameRecord], fitted: list[FrameRecord]) -> Decision:
     if lit < NORMAL_FLASH_VIEWS:
         seen += f"; under {NORMAL_FLASH_VIEWS} lit ones leave the normals as the cloud has them"
     return Decision("flash", Action.GIVEN, seen)
+
+
+def _calibration(session: Session) -> Decision:
+    """What of the calibration is applied; what is not known has a fallback, which is not named here."""
+    name = "calibration"
+    entries, warning = session.read_calibration()
+    known = [words for entry, words in _CALIBRATED.items() if entry in entries]
+    applied = ", ".join(dict.fromkeys(known))
+    left_out = "" if warning is None else f"; {warning[0].lower()}{warning[1:].rstrip('.')}"
+    if not known:
+        return Decision(name, Action.SKIP, f"nothing is known of camera and flash{left_out}")
+    return Decision(name, Action.GIVEN, f"{applied}{left_out}")
 
 
 def _redundant_views(

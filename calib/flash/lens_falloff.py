@@ -99,7 +99,7 @@ def fit_lens_falloff(measured: Sequence[LitBoard], lens: Floats, size: tuple[int
         raise FlatFieldError(
             "These boards do not tell the lens's fall-off from the flash's beam: the corner gets "
             f"{passed:.2f} ± {sigma:.2f} (at most ± {_LARGEST_SIGMA:g}; squares reach {found.reach:.0%} of "
-            "the way to it). Hold the board into the corners too, and nearer; or use `relight calibrate flat`."
+            "the way to it). Hold the board nearer and into the corners, or use `relight calibrate flat`."
         )
     return found
 

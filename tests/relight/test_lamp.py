@@ -24,6 +24,8 @@ from capture.session import Session
 from relight.cloud import CloudConfig
 from relight.lamp import Lamp, beam, lamp_of
 from relight.photometric import ALBEDO_95, SolveConfig, solve
+from relight.plan import Action
+from relight.planning import make_plan
 from relight.scene import NoiseModel, load_scene
 
 SIZE = 96
@@ -197,3 +199,20 @@ def test_a_session_brings_its_lamp_unless_it_was_calibrated_otherwise(frames, tm
     assert scene.lamp.strength is None
     assert scene.lamp.falloff == 3.0  # where it shines depends on no setting
     assert "flash_strength" in scene.calibration_warnings[0]
+
+
+def test_the_plan_says_what_of_a_calibration_is_applied(frames, tmp_path):
+    session = write_session(tmp_path / "S", frames[:6], PointCloud(*cloud_of(HEAD, 400, 0.0004), None))
+
+    def planned():
+        plan = make_plan(Session.open(session.path))
+        return next(decision for decision in plan.decisions if decision.name == "calibration")
+
+    assert planned().action is Action.GIVEN
+    assert planned().reason == "the flash's place"
+    dark = Quantity.of([0.01] * 3, "1", "darks", made_with=Controls(gain=4.0))
+    save_calibration(Calibration(dark=dark), session.calibration_path)
+    Session.open(session.path).update_info(device={"iso": 200})
+    assert "dark (the gain is 2, not 4)" in planned().reason
+    session.calibration_path.unlink()
+    assert planned().action is Action.SKIP

@@ -98,6 +98,7 @@ def test_a_session_with_poses_and_a_cloud_can_be_fitted(tmp_path):
         "cloud": Action.GIVEN,
         "normals": Action.RUN,
         "masks": Action.SKIP,
+        "calibration": Action.SKIP,
         "scale": Action.GIVEN,
         "face_prior": Action.RUN,
         "room_shading": Action.RUN,
