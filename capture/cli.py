@@ -110,6 +110,12 @@ def _parser() -> argparse.ArgumentParser:
     camera.add_argument(
         "--mains", type=int, choices=(0, 50, 60), help="frequency of the mains where you are; 0 = daylight"
     )
+    camera.add_argument(
+        "--calibration",
+        type=Path,
+        metavar="FILE",
+        help="calibration.json of camera and flash; told at once where the camera is set otherwise",
+    )
     camera.add_argument("--restore", action="store_true", help="put the camera's controls back afterwards")
     kept = parser.add_argument_group("pictures that are kept: every lit one, and the sharpest unlit ones")
     kept.add_argument("--unlit-rate", type=float, default=6.0, metavar="HZ", help="unlit ones (default 6)")
@@ -146,6 +152,7 @@ def _config(args: argparse.Namespace) -> CaptureConfig:
         kept_rate_hz=args.unlit_rate,
         keep_all=args.keep_all,
         restore=args.restore,
+        calibration=args.calibration,
     )
 
 

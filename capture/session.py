@@ -70,7 +70,6 @@ class Session:
         self._by_file: dict[str, FrameRecord] = {}
         self._log = FrameLog(path / "frames.jsonl")
         self._radiometry: Radiometry | None = None
-        self._calibration_said = False
 
     @classmethod
     def create(
@@ -276,7 +275,9 @@ class Session:
     def radiometry(self) -> Radiometry:
         """What makes radiance of this session's pixels."""
         if self._radiometry is None:
-            entries, _ = self.read_calibration()
+            entries, warning = self.read_calibration()
+            if warning is not None:
+                logger.warning("%s: %s", self.calibration_path, warning)
             self._radiometry = radiometry_of(entries, self.info["image"]["transfer"])
         return self._radiometry
 
@@ -289,19 +290,14 @@ class Session:
         """The entries of calibration.json that hold for this session; none where there is no file.
 
         Returns:
-            The entries, and a sentence on those that were made with other settings and are not applied. It
-            is logged the first time.
+            The entries, and a sentence on those that were made with other settings and are not applied.
 
         Raises:
             CalibrationError: malformed.
         """
         if not self.calibration_path.is_file():
             return Fields({}, str(self.calibration_path), CalibrationError), None
-        entries, warning = applicable_entries(read_calibration_entries(self.calibration_path), self.controls)
-        if warning is not None and not self._calibration_said:
-            logger.warning("%s: %s", self.calibration_path, warning)
-            self._calibration_said = True
-        return entries, warning
+        return applicable_entries(read_calibration_entries(self.calibration_path), self.controls)
 
     def load_mask(self, record: FrameRecord) -> NDArray[np.uint8] | None:
         """The subject's coverage in a frame: [H, W] 0..255; None where there is no mask."""

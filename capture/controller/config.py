@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from capture.devices.camera import CameraProfile
 from capture.devices.flash import LONGEST_ON_S, MOST_PULSES, SHORTEST_PERIOD_S
@@ -29,6 +30,7 @@ class CaptureConfig:
         keep_all: Whether every frame keeps its picture.
         reserve_bytes: Free space on the disk at which the capture stops.
         restore: Whether the camera's controls are put back afterwards.
+        calibration: calibration.json of camera and flash, that the session shall carry.
     """
 
     duration_s: float = 20.0
@@ -41,6 +43,7 @@ class CaptureConfig:
     keep_all: bool = False
     reserve_bytes: int = 300 << 20
     restore: bool = False
+    calibration: Path | None = None
 
     def __post_init__(self) -> None:
         """Checks the numbers."""

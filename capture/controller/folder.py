@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from capture.calibration_file import Quantity, write_calibration_entries
+from capture.calibration_file import Quantity, read_calibration_entries, write_calibration_entries
 from capture.cameras import Camera
 from capture.controller.config import CaptureConfig
 from capture.controller.edge_log import drop_edges_after
@@ -30,9 +30,11 @@ def create_folder(
 
     Raises:
         SessionError: `out` is in use.
+        CalibrationError: The calibration that it shall carry is missing or malformed.
     """
     stream = camera.format
-    return Session.create(
+    given = None if config.calibration is None else read_calibration_entries(config.calibration)
+    session = Session.create(
         out,
         source={"kind": "capture", "camera": camera.info.url, "flash": flash.info.url},
         width=stream.width,
@@ -52,6 +54,10 @@ def create_folder(
             "level": config.level,
         },
     )
+    if given is not None:
+        entries = {name: value for name, value in given.values.items() if name not in ("schema", "version")}
+        write_calibration_entries(session.calibration_path, entries)
+    return session
 
 
 def resume_folder(out: Path, camera: CameraDevice, looker: FrameLooker, on_s: float) -> tuple[Session, float]:

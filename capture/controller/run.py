@@ -155,8 +155,12 @@ class _Capture:
         self._tagging: Future[dict[int, FrameTag]] | None = None
 
     def create(self, out: Path) -> Session:
-        """A new session folder."""
-        return create_folder(out, self._camera, self._flash, self._lock, self._config)
+        """A new session folder; what of its calibration does not hold as the camera is locked is told."""
+        session = create_folder(out, self._camera, self._flash, self._lock, self._config)
+        _, warning = session.read_calibration()
+        if warning is not None:
+            self._warn(f"Calibration: {warning[0].lower()}{warning[1:]}")
+        return session
 
     def resume(self, out: Path) -> Session:
         """An interrupted one; frames of it that have no tag yet are looked at again."""

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from capture.controller.interrupts import Interrupts
-from capture.errors import SessionError
+from capture.errors import CalibrationError, SessionError
 from capture.session import Session
 
 Usage = namedtuple("Usage", "free")
@@ -336,3 +336,23 @@ def test_light_that_changes_but_not_when_the_flash_reports_is_not_the_flash(desk
     assert outcome.stopped is not None
     assert outcome.session.status == "interrupted"
     assert all(record.flash is None and record.file is not None for record in outcome.session.frames)
+
+
+def test_a_session_carries_its_calibration_and_says_what_does_not_hold(desk, tmp_path):
+    def entry(**made_with):
+        return {"value": [0.01, 0.01, 0.01], "unit": "1", "source": "test", "made_with": made_with}
+
+    path = tmp_path / "calibration.json"
+    header = {"schema": "relight-calibration", "version": 1}
+    path.write_text(json.dumps(header | {"dark": entry(gain=7.5), "noise_read": entry()}))
+    outcome = desk.capture(duration_s=3.0, calibration=path)
+    told = [sentence for sentence in outcome.warnings if sentence.startswith("Calibration: ")]
+    assert len(told) == 1
+    assert "dark (the gain is" in told[0]
+    entries, _ = outcome.session.read_calibration()
+    assert "dark" not in entries
+    assert "noise_read" in entries
+    assert "flash_offset_cam_m" in entries  # what the rig knows of itself stays
+    with pytest.raises(CalibrationError, match="cannot be read"):
+        desk.capture(out=tmp_path / "T", calibration=tmp_path / "none.json")
+    assert not (tmp_path / "T").exists()
