@@ -82,3 +82,16 @@ def test_a_second_fit_goes_on_from_the_checkpoint_unless_the_seed_is_another(ses
 def test_without_time_left_a_refinement_is_asked_for_the_best_it_has(session):
     folder = fit(session, "plain", device="cpu", name="short", max_seconds=0.01)
     assert load_portrait(folder).info["seconds"] == 0.0
+
+
+def test_the_papers_preset_goes_from_a_session_to_a_report_and_on_from_its_checkpoint(session):
+    settings = {"crop": 32, "steps": 2, "baked_views": 2}
+    folder = fit(session, "paper", device="cpu", settings=settings)
+    assert load_portrait(folder).decoder.kind == "paper"
+    assert (folder / "report.html").is_file()
+    metrics = json.loads((folder / "metrics.json").read_text())
+    assert metrics["solve"]["refinement"]["steps"] == 2
+    assert any("VGG-16" in sentence for sentence in metrics["warnings"])
+    fit(session, "paper", device="cpu", settings=settings | {"steps": 4})
+    assert load_portrait(folder).info["refinement"]["held_out_db"][-1][0] == 4
+    assert len(list((folder / "checkpoint").glob("*.safetensors"))) == 1
