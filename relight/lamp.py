@@ -5,13 +5,16 @@ Without a calibration it shines the same in every direction, and its strength is
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from calib.calibration import Calibration
+from relight.errors import PortraitError
 
 _LEAST_COSINE = 0.05
 """To the side of a lamp the model says nothing any more, and a division by it would make noise of it."""
@@ -53,6 +56,31 @@ def lamp_of(calibration: Calibration) -> Lamp:
         strength = known("colour") @ strength
         strength = strength if (strength > 0).all() else None
     return Lamp(known("flash_axis"), float(known("flash_falloff").item()), strength)
+
+
+def beam_as_json(lamp: Lamp) -> dict[str, Any] | None:
+    """The beam for a portrait's `info`; None where it is even."""
+    if lamp.falloff == 0:
+        return None
+    return {"axis_cam": lamp.axis_cam.tolist(), "falloff": lamp.falloff}
+
+
+def lamp_of_portrait(info: Mapping[str, Any]) -> Lamp:
+    """The beam that a portrait was solved with; its strength is the portrait's own.
+
+    Raises:
+        PortraitError: it is no beam.
+    """
+    said = info.get("flash_beam")
+    if said is None:
+        return Lamp()
+    try:
+        axis, falloff = np.array(said["axis_cam"], dtype=np.float64), float(said["falloff"])
+    except (KeyError, TypeError, ValueError) as cause:
+        raise PortraitError(f"The portrait's flash_beam is {said!r}; fit it again.") from cause
+    if axis.shape != (3,) or not np.isfinite(axis).all() or not 0 <= falloff < np.inf:
+        raise PortraitError(f"The portrait's flash_beam is {said!r}; fit it again.")
+    return Lamp(axis, falloff)
 
 
 def beam(to_light: torch.Tensor, axis_world: torch.Tensor, falloff: float) -> torch.Tensor:

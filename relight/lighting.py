@@ -37,6 +37,7 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from relight.environment import DiffuseIrradiance, cluster_lights
+from relight.lamp import Lamp, beam
 from relight.panorama import panorama_to_sh, read_panorama
 from relight.prefiltering import GlossyEnvironment, even_light
 from relight.spherical_harmonics import (
@@ -69,6 +70,7 @@ def shade(
     flash: int | None = None,
     visibility: Visibility | None = None,
     reflectance: Reflectance | None = None,
+    lamp: Lamp | None = None,
 ) -> Tensor:
     """Radiance of the surface under a light, differentiable in the maps and colours.
 
@@ -85,6 +87,7 @@ def shade(
         visibility: for shadows; without it nothing is in shadow.
         reflectance: of the subject, for the flash, point lights and environments; by default it is
             Lambertian.
+        lamp: how the flash shines; by default equally in all directions.
 
     Returns:
         [..., 3], linear, not premultiplied, 0 where the mask is 0; float32 or float64 as the maps.
@@ -97,7 +100,7 @@ def shade(
         return torch.zeros_like(maps.albedo)
     if flash is None and camera is not None:
         flash = camera.flash
-    capture = CaptureLight(camera, c_room, c_flash, flash_offset_cam_m, bool(flash), reflectance)
+    capture = CaptureLight(camera, c_room, c_flash, flash_offset_cam_m, bool(flash), reflectance, lamp)
     return surface.scatter(light.radiance(surface, capture))
 
 
@@ -111,6 +114,7 @@ class CaptureLight:
     flash_offset_cam_m: ArrayLike | Tensor | None
     flash: bool
     reflectance: Reflectance | None = None
+    lamp: Lamp | None = None
 
     def room_radiance(self, surface: Surface) -> Tensor:
         """A C_room s: [P, 3]; or what the maps know of it in colour."""
@@ -121,7 +125,7 @@ class CaptureLight:
         return surface.albedo * surface.vector(self.c_room) * surface.shading
 
     def flash_radiance(self, surface: Surface) -> Tensor:
-        """A C_flash / d^2 max(0, <n, l>): [P, 3]; or what the maps know of it."""
+        """A C_flash / d^2 max(0, <n, l>) cos(angle to its axis)^mu: [P, 3]; or what the maps know of it."""
         if surface.flash_radiance is not None:
             return surface.flash_radiance
         if self.c_flash is None or self.camera is None:
@@ -130,7 +134,12 @@ class CaptureLight:
         if self.flash_offset_cam_m is not None:
             cam_from_world = surface.vector(self.camera.cam_from_world[:3, :3])
             position = position + surface.vector(self.flash_offset_cam_m) @ cam_from_world
-        return surface.vector(self.c_flash) * self.response(surface, position)
+        radiance = surface.vector(self.c_flash) * self.response(surface, position)
+        if self.lamp is None or self.lamp.falloff == 0:
+            return radiance
+        to_light, _ = direction_to(surface.points, position)
+        axis = surface.vector(self.lamp.axis_world(self.camera.cam_from_world))
+        return radiance * beam(to_light, axis, self.lamp.falloff)[:, None]
 
     def response(self, surface: Surface, position: Tensor, albedo: Tensor | None = None) -> Tensor:
         """Radiance [P, 3] under a point light of unit colour at [3], without shadows.

@@ -43,7 +43,7 @@ from scipy.spatial import cKDTree
 from relight.cloud import CloudConfig, SurfaceCloud, prepare_cloud
 from relight.errors import PlanError
 from relight.infill import infill
-from relight.lamp import Lamp, beam
+from relight.lamp import Lamp, beam, beam_as_json
 from relight.mirror_infill import mirror_infill
 from relight.observations import Observations, observe_points
 from relight.portrait import Portrait
@@ -215,6 +215,7 @@ def solve(scene: Scene, config: SolveConfig = SolveConfig(), progress: Progress 
             "cloud_noise": surface.noise,
             "known_share": round(float(known.float().mean()), 4),
             "mirrored_share": round(from_mirror, 4),
+            "flash_beam": beam_as_json(scene.lamp),
             "absolute_albedo": measured.level is not None and not warnings,
             "warnings": warnings,
         },

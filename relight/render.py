@@ -25,6 +25,7 @@ from capture.cameras import Camera
 from capture.images import decode_image, encode_image, write_exr, write_png
 from capture.transfer import to_display
 from capture.video.writer import VideoWriter
+from relight.lamp import lamp_of_portrait
 from relight.lighting import CapturedLight, FlashLight, Light, RoomLight, SumLight, shade
 from relight.maps import Maps, render_maps
 from relight.portrait import Portrait
@@ -74,6 +75,7 @@ class PortraitRenderer:
                 flash=flash,
                 visibility=visibility,
                 reflectance=portrait.reflectance,
+                lamp=lamp_of_portrait(portrait.info),
             )
             for name, light in lights.items()
         }

@@ -22,10 +22,13 @@ from capture.controls import Controls
 from capture.ply import PointCloud
 from capture.session import Session
 from relight.cloud import CloudConfig
-from relight.lamp import Lamp, beam, lamp_of
+from relight.errors import PortraitError
+from relight.lamp import Lamp, beam, lamp_of, lamp_of_portrait
+from relight.lighting import CapturedLight
 from relight.photometric import ALBEDO_95, SolveConfig, solve
 from relight.plan import Action
 from relight.planning import make_plan
+from relight.render import render_view
 from relight.scene import NoiseModel, load_scene
 
 SIZE = 96
@@ -216,3 +219,26 @@ def test_the_plan_says_what_of_a_calibration_is_applied(frames, tmp_path):
     assert "dark (the gain is 2, not 4)" in planned().reason
     session.calibration_path.unlink()
     assert planned().action is Action.SKIP
+
+
+def test_a_lit_frame_is_given_back_through_the_beam(frames, cloud):
+    radiances = under(SPOT, frames)
+    portrait = solve(MemoryScene(frames, radiances, cloud, lamp=SPOT), CONFIG)
+    frame, radiance = next((f, r) for f, r in zip(frames, radiances, strict=True) if f.camera.flash)
+    maps, rendered = render_view(portrait, frame.camera, {"captured": CapturedLight()}, shadows=False)
+    inside = (frame.hit & (maps.mask.numpy() > 0.99)).nonzero()
+    off = rendered["captured"].numpy()[inside].mean(1) / radiance[inside].mean(1) - 1
+    assert abs(np.median(off)) < 0.01
+    even = replace(portrait, info={})
+    _, wrong = render_view(even, frame.camera, {"captured": CapturedLight()}, shadows=False)
+    unlike = wrong["captured"].numpy()[inside].mean(1) / radiance[inside].mean(1) - 1
+    assert np.median(np.abs(unlike)) > 5 * np.median(np.abs(off))
+
+
+@pytest.mark.parametrize(
+    "said", [3, {"axis_cam": [0, 0], "falloff": 1}, {"axis_cam": [0, 0, 1], "falloff": -1}]
+)
+def test_a_beam_that_is_none_is_refused(said):
+    with pytest.raises(PortraitError, match="flash_beam"):
+        lamp_of_portrait({"flash_beam": said})
+    assert lamp_of_portrait({}).falloff == 0.0
