@@ -88,9 +88,10 @@ class FrameSource:
             )
 
     def radiance(self, frame: Frame) -> Floats:
-        """[H, W, 3] linear, undistorted, finite."""
+        """[H, W, 3] linear, undistorted, finite, not negative."""
         radiance = self._session.load_radiance(self._records[frame.index])
-        radiance = np.nan_to_num(radiance, nan=0.0, posinf=1.0, neginf=0.0)
+        # Noise about a calibrated dark level is negative half of the time; here logarithms are taken.
+        radiance = np.maximum(np.nan_to_num(radiance, nan=0.0, posinf=1.0, neginf=0.0), np.float32(0.0))
         if frame.index in self._distorted:
             radiance = self._straightened(radiance, frame)
         return radiance
