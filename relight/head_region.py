@@ -176,7 +176,7 @@ def _flash_ratio(session: Session, lit: FrameRecord, unlit: FrameRecord) -> NDAr
         cv2.GaussianBlur(_small(np.nan_to_num(session.load_radiance(record)).mean(axis=2)), (0, 0), 1.5)
         for record in (lit, unlit)
     ]
-    with_flash, without = (np.minimum(picture, np.float32(1.0)) for picture in pictures)
+    with_flash, without = (np.clip(picture, np.float32(0.0), np.float32(1.0)) for picture in pictures)
     if with_flash.shape != without.shape:
         without = cv2.resize(without, with_flash.shape[::-1], interpolation=cv2.INTER_AREA)
     return np.asarray((with_flash - without) / (without + _FLOOR), np.float32)

@@ -2,6 +2,7 @@
 
 import re
 from html.parser import HTMLParser
+from xml.etree import ElementTree
 
 import cv2
 import numpy as np
@@ -134,6 +135,8 @@ def read_page():
         for outside in ("http:", "https:", "<script", "src="):
             assert outside not in html
         assert html.count("<svg") == html.count("</svg>")
+        for drawing in re.findall(r"<svg.*?</svg>", html, re.DOTALL):
+            ElementTree.fromstring(drawing)  # every mark is closed, every character escaped
         assert "nan" not in re.sub(r"<[^>]*>", "", html)
         assert not re.search(r'="[^"]*nan', html)
         HTMLParser().feed(html)
