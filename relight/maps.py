@@ -105,15 +105,22 @@ def splat_maps(portrait: Portrait, camera: Camera) -> Maps:
         values, mask, point_ids = _enlarged(values, mask, point_ids, camera)
     support = (mask > 0)[..., None]
     values = torch.where(support, values, 0.0)
-    normals, depth = values[..., :3], values[..., 12]
+    normals, room, depth = values[..., :3], values[..., 6:9], values[..., 12]
+    normals = normals / torch.linalg.vector_norm(normals, dim=-1, keepdim=True).clamp(min=1e-12)
+    points = torch.where(support, unproject(depth, camera), 0.0)
+    if portrait.room_gloss is not None:
+        on = mask > 0
+        centre = torch.as_tensor(camera.centre_world).to(points)
+        seen = points[on], normals[on], values[..., 11][on].clamp(min=0.0)
+        room[on] += portrait.room_gloss.radiance(*seen, centre, portrait.reflectance)
     return Maps(
         albedo=values[..., 3:6].clamp(min=0.0),
-        normals_world=normals / torch.linalg.vector_norm(normals, dim=-1, keepdim=True).clamp(min=1e-12),
-        room_radiance=values[..., 6:9].clamp(min=0.0),
+        normals_world=normals,
+        room_radiance=room.clamp(min=0.0),
         shading=values[..., 9].clamp(0.0, 1.0),
         mask=mask,
         depth=depth,
-        points_world=torch.where(support, unproject(depth, camera), 0.0),
+        points_world=points,
         confidence=values[..., 10].clamp(0.0, 1.0),
         gloss=values[..., 11].clamp(min=0.0),
         point_ids=point_ids,

@@ -48,6 +48,7 @@ from relight.mirror_infill import mirror_infill
 from relight.observations import Observations, observe_points
 from relight.portrait import Portrait
 from relight.reflectance import GRAZING, Reflectance, fit_local_gloss, fit_reflectance
+from relight.room_gloss import RoomGloss, fit_room_gloss
 from relight.scene import Scene
 from relight.shape_from_flash import FlashResponses, ShapeConfig, refine_shape
 from relight.stages import Progress, no_progress
@@ -90,6 +91,8 @@ class SolveConfig:
         mirror: Whether what no flash reached of a face is taken from its other side, before its neighbours.
         shape: How the cloud's surface is made to fit its shading (`relight.shape_from_flash`); None = it
             stays as the cloud has it, and only normals are fitted.
+        room_gloss: Whether the gloss of the room's light, which moves with the camera, is fitted
+            (`relight.room_gloss`); otherwise the room is the mean over the views.
         known: Information (sum of weighted squared cosines over the flash frames) that makes an albedo
             known: 0.25 is one flash frame at 60 degrees.
     """
@@ -100,6 +103,7 @@ class SolveConfig:
     fit_gains: bool = True
     mirror: bool = True
     shape: ShapeConfig | None = None
+    room_gloss: bool = False
     known: float = 0.25
 
 
@@ -150,10 +154,11 @@ def solve(scene: Scene, config: SolveConfig = SolveConfig(), progress: Progress 
         scene.points.cpu().numpy(), normals_given, [view.camera for view in scene.views], config.cloud
     )
     progress("cloud", 1.0)
-    measured = _measure(scene, surface, config, progress)
+    carved = None
     if config.shape is not None:
-        surface = _shaped(surface, measured, config.shape, progress)
-        measured = _measure(scene, surface, config, progress)
+        measured = _measure(scene, surface, replace(config, room_gloss=False), progress)
+        surface, carved = _shaped(surface, measured, config.shape, progress), measured.on_subject
+    measured = _measure(scene, surface, config, progress, carved)
     flash, relative, reflectance = measured.flash, measured.relative, measured.reflectance
     points = torch.from_numpy(surface.points).to(scene.device)
     prior = torch.from_numpy(surface.normals_world).to(scene.device)
@@ -219,6 +224,7 @@ def solve(scene: Scene, config: SolveConfig = SolveConfig(), progress: Progress 
             "absolute_albedo": measured.level is not None and not warnings,
             "warnings": warnings,
         },
+        room_gloss=measured.room_gloss,
     )
     return portrait if bool(measured.on_subject.all()) else portrait.subset(measured.on_subject)
 
@@ -238,6 +244,7 @@ class _Measured:
         relative: Standard deviation of a flash observation relative to its albedo.
         tint: [3] colour of the flash, mean 1.
         level: Calibrated strength of the flash, None = unknown.
+        room_gloss: What of the room's light is not in `room`, for it moves with the camera.
     """
 
     on_subject: torch.Tensor
@@ -250,10 +257,19 @@ class _Measured:
     relative: float
     tint: list[float]
     level: float | None
+    room_gloss: RoomGloss | None
 
 
-def _measure(scene: Scene, surface: SurfaceCloud, config: SolveConfig, progress: Progress) -> _Measured:
+def _measure(
+    scene: Scene,
+    surface: SurfaceCloud,
+    config: SolveConfig,
+    progress: Progress,
+    on_subject: torch.Tensor | None = None,
+) -> _Measured:
     """Samples the frames at a surface and fits what all its points share.
+
+    `on_subject` [P] says what the masks leave of it; None = it is told from them.
 
     Raises:
         PlanError: The frames do not show the surface, or are no brighter with the flash.
@@ -264,7 +280,8 @@ def _measure(scene: Scene, surface: SurfaceCloud, config: SolveConfig, progress:
     normals = torch.from_numpy(surface.normals_world).to(scene.device)
     # What masks carve away takes no part; it is dropped at the end, for a copy of the observations would be
     # large.
-    on_subject = observations.outside <= _OUTSIDE_LIMIT
+    if on_subject is None:
+        on_subject = observations.outside <= _OUTSIDE_LIMIT
     observations.cosine.mul_(on_subject)
     if not bool((observations.cosine > 0).any()):
         raise PlanError(
@@ -284,8 +301,34 @@ def _measure(scene: Scene, surface: SurfaceCloud, config: SolveConfig, progress:
     flash = _normalised(flash, scale, gains)
     flash = replace(flash, gloss=_local_gloss(flash, points, normals, reflectance, surface.spacing))
     relative = _relative_noise(flash, normals, reflectance)
+    room_gloss = None
+    if config.room_gloss:
+        centres = [view.camera.centre_world for view in scene.views if view.flash == 0]
+        unlit = ~observations.flash
+        moving = (
+            points,
+            normals,
+            flash.gloss,
+            reflectance,
+            observations.radiance[unlit],
+            observations.cosine[unlit],
+            torch.from_numpy(np.stack(centres)).to(points),
+        )
+        room_gloss = fit_room_gloss(*moving)
+        if room_gloss is not None:
+            room = room - room_gloss.mean_radiance(*moving[:4], *moving[5:])
     return _Measured(
-        on_subject, room, room_information, flash, scale, gains, reflectance, relative, tint, level
+        on_subject,
+        room,
+        room_information,
+        flash,
+        scale,
+        gains,
+        reflectance,
+        relative,
+        tint,
+        level,
+        room_gloss,
     )
 
 

@@ -26,6 +26,7 @@ from relight.alignment import Similarity
 from relight.decoder import Decoder, restored_decoder
 from relight.errors import PortraitError
 from relight.reflectance import Reflectance
+from relight.room_gloss import RoomGloss
 
 VERSION = 2
 """1 had no decoder; it is still read."""
@@ -74,6 +75,7 @@ class Portrait:
         reflectance: Of the whole subject.
         info: Free-form facts: software, source, settings, warnings.
         decoder: What makes the maps of a view; None = the points are splatted.
+        room_gloss: What a view adds to `room_radiance` for the gloss that moves with it; None = nothing.
     """
 
     points: torch.Tensor
@@ -93,6 +95,7 @@ class Portrait:
     reflectance: Reflectance
     info: Mapping[str, Any]
     decoder: Decoder | None = None
+    room_gloss: RoomGloss | None = None
 
     def to(self, device: torch.device | str) -> Portrait:
         """The portrait with its tensors on a device."""
@@ -121,6 +124,7 @@ class Portrait:
             c_flash=_vector([scale**2 * value for value in self.c_flash]),  # it is divided by d^2
             flash_offset_cam_m=_vector([scale * value for value in self.flash_offset_cam_m]),
             decoder=None if self.decoder is None else self.decoder.transformed(similarity),
+            room_gloss=None if self.room_gloss is None else self.room_gloss.turned(turn),
         )
 
     def save(self, folder: Path) -> None:
@@ -133,9 +137,10 @@ class Portrait:
         tensors = {name: getattr(self, name).detach().cpu().float().clone() for name in _TENSORS}
         content = {"schema": "relight-portrait", "version": VERSION, "points": len(self.points)}
         for field in fields(self):
-            if field.name not in _TENSORS and field.name not in ("reflectance", "decoder"):
+            if field.name not in _TENSORS and field.name not in ("reflectance", "decoder", "room_gloss"):
                 content[field.name] = getattr(self, field.name)
         content["reflectance"] = asdict(self.reflectance)
+        content["room_gloss"] = None if self.room_gloss is None else self.room_gloss.coefficients.tolist()
         content["decoder"] = None
         if self.decoder is not None:
             content["decoder"] = {"kind": self.decoder.kind, "settings": self.decoder.settings()}
@@ -198,6 +203,7 @@ def load_portrait(folder: Path, device: torch.device | str = "cpu") -> Portrait:
             reflectance=_reflectance(**content["reflectance"]),
             info=dict(content["info"]),
             decoder=_decoder(content["decoder"], tensors) if version > 1 else None,
+            room_gloss=_room_gloss(content.get("room_gloss")),
         )
     except PortraitError as error:
         raise PortraitError(f"The portrait in {folder} cannot be read: {error}") from error
@@ -229,6 +235,10 @@ def _reflectance(retro: Any, alpha: Any, f0: Any) -> Reflectance:
     if not (0.0 <= retro < math.inf and 0.0 <= f0 < math.inf):
         raise ValueError(f"retro {retro} and f0 {f0} are not both finite and at least 0")
     return Reflectance(retro, _positive(alpha), f0)
+
+
+def _room_gloss(rows: Any) -> RoomGloss | None:
+    return None if rows is None else RoomGloss(torch.tensor([_vector(row) for row in rows]))
 
 
 def _vector(values: Any) -> tuple[float, float, float]:
