@@ -54,7 +54,10 @@ from relight.spherical_harmonics import rotate_sh, rotation_about_up
 _LOG = logging.getLogger(__name__)
 
 # The other files of a rendered view, NAME.albedo.exr beside NAME.<light>.exr: no light may be called so.
-_TAKEN_NAMES = ("albedo", "normal", "shading", "mask", "depth")
+_TAKEN_NAMES = (
+    *("albedo", "normal", "shading", "mask", "depth"),
+    *("albedo_sigma", "normal_sigma", "unobserved_flash", "unobserved_view"),
+)
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.+-]{0,79}")
 # "+" joins two lights only before what could start one, so that 1e+3 and a+b.hdr stay whole.
 _JOINT = re.compile(r"\+(?=\s*[A-Za-z_]+\s*(?:[:;+]|$))")

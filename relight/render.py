@@ -1,6 +1,8 @@
 """Pictures of a portrait: any view, under any light, as maps, linear pictures, display pictures and video.
 
     NAME.albedo.exr  NAME.normal.exr (world, unit)  NAME.shading.exr  NAME.mask.exr (0..1)  NAME.depth.exr
+    NAME.albedo_sigma.exr, NAME.normal_sigma.exr, NAME.unobserved_flash.exr, NAME.unobserved_view.exr
+                      how far these can be believed, see `relight.confidence`
     NAME.<light>.exr  linear, not premultiplied      NAME.<light>.png  for looking, on black
 
 NAME is the name of the camera, the stem of its file. Pictures under the captured light, the room or the
@@ -25,6 +27,7 @@ from capture.cameras import Camera
 from capture.images import decode_image, encode_image, write_exr, write_png
 from capture.transfer import to_display
 from capture.video.writer import VideoWriter
+from relight.confidence import confidence_maps, seen_by_any
 from relight.lamp import lamp_of_portrait
 from relight.lighting import CapturedLight, FlashLight, Light, RoomLight, SumLight, shade
 from relight.maps import Maps, render_maps
@@ -101,6 +104,7 @@ def render_files(
     out: Path,
     *,
     maps: bool = False,
+    captured: Sequence[Camera] = (),
     shadows: bool = True,
     progress: Progress = no_progress,
 ) -> list[Path]:
@@ -112,6 +116,7 @@ def render_files(
         lights: By name.
         out: Folder; made if it is not there.
         maps: Whether to write the maps too.
+        captured: Cameras of the capture, from which the maps tell what no frame saw.
         shadows: Whether new lights cast shadows.
         progress: Told ("render", fraction).
 
@@ -122,10 +127,12 @@ def render_files(
     renderer = PortraitRenderer(portrait, shadows=shadows)
     written: list[Path] = []
     exposures: dict[str, float] = {}
+    seen = seen_by_any(portrait, captured) if maps and captured else None
     for number, camera in enumerate(cameras):
         view, radiances = renderer.view(camera, lights)
         if maps:
-            written += _write_maps(view, out, camera.name)
+            believed = confidence_maps(portrait, view, seen)
+            written += _write_maps(view, believed, out, camera.name)
         for name, radiance in radiances.items():
             exposure = exposures.setdefault(name, _exposure(lights[name], radiance, view.mask))
             written.append(out / f"{camera.name}.{name}.exr")
@@ -241,13 +248,14 @@ def _exposure(light: Light, radiance: torch.Tensor, mask: torch.Tensor) -> float
     return exposure_for(radiance, mask)
 
 
-def _write_maps(view: Maps, out: Path, name: str) -> list[Path]:
+def _write_maps(view: Maps, believed: Mapping[str, torch.Tensor], out: Path, name: str) -> list[Path]:
     layers = {
         "albedo": view.albedo,
         "normal": view.normals_world,
         "shading": view.shading,
         "mask": view.mask,
         "depth": view.depth,
+        **believed,
     }
     written = []
     for layer, values in layers.items():

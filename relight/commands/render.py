@@ -48,7 +48,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="views to render, as cameras.json (default: some captured)",
     )
     where.add_argument("--orbit", action="store_true", help="a video around the head")
-    parser.add_argument("--maps", action="store_true", help="write albedo, normal, shading, mask, depth maps")
+    parser.add_argument(
+        "--maps",
+        action="store_true",
+        help="write albedo, normal, shading, mask, depth, and how far they can be believed",
+    )
     parser.add_argument("--no-shadows", action="store_true", help="let new lights pass through the head")
     parser.add_argument(
         "--seconds",
@@ -92,7 +96,8 @@ def run(args: argparse.Namespace) -> None:
             said = "\n".join(str(video) for video in videos.values())
         else:
             cameras = _cameras(session, args.cameras)
-            said = _pictures(portrait, cameras, lights, args, progress)
+            captured = list(session.load_scene_cameras().values())
+            said = _pictures(portrait, cameras, captured, lights, args, progress)
     print(said)
 
 
@@ -130,6 +135,7 @@ def _orbits(
 def _pictures(
     portrait: Portrait,
     cameras: Sequence[Camera],
+    captured: Sequence[Camera],
     lights: Mapping[str, Light],
     args: argparse.Namespace,
     progress: Progress,
@@ -137,7 +143,14 @@ def _pictures(
     from relight.render import render_files
 
     files = render_files(
-        portrait, cameras, lights, args.out, maps=args.maps, shadows=not args.no_shadows, progress=progress
+        portrait,
+        cameras,
+        lights,
+        args.out,
+        maps=args.maps,
+        captured=captured,
+        shadows=not args.no_shadows,
+        progress=progress,
     )
     return f"{len(files)} files of {len(cameras)} views in {args.out}"
 

@@ -8,6 +8,7 @@ import torch
 from analytic_scene import arc, looking_at, portrait_of, sphere_portrait
 
 from capture.images import read_image
+from relight.confidence import NAMES
 from relight.lighting import (
     CapturedLight,
     DirectionalLight,
@@ -92,7 +93,7 @@ def truth(camera):
 
 def test_files_have_the_names_that_other_tools_read(rendered):
     out, files, _ = rendered
-    maps = ["albedo", "normal", "shading", "mask", "depth"]
+    maps = ["albedo", "normal", "shading", "mask", "depth", *NAMES]
     expected = {f"{name}.{layer}.exr" for name in ("0010", "left.view") for layer in [*maps, *LIGHTS]}
     expected |= {f"{name}.{light}.png" for name in ("0010", "left.view") for light in LIGHTS}
     assert {path.name for path in out.iterdir()} == expected
