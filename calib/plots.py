@@ -172,6 +172,7 @@ def graph(
     label: str,
     axes: tuple[str, str],
     band: tuple[Floats, Floats, Floats] | None = None,
+    points: tuple[Floats, Floats] | None = None,
 ) -> str:
     """Curves over numbered axes.
 
@@ -180,10 +181,13 @@ def graph(
         label: what it shows.
         axes: names of x and y.
         band: x [n], lower [n] and upper [n] end of a shaded region.
+        points: x [m] and y [m] of dots.
     """
     width, height, left, bottom = 640.0, 260.0, 64.0, 40.0
-    ys = [y for _, y, _ in curves] + ([] if band is None else [band[1], band[2]])
-    x_all, y_all = np.concatenate([x for x, _, _ in curves]), np.concatenate(ys)
+    marks = (np.zeros(0), np.zeros(0)) if points is None else points
+    ends = [] if band is None else [band[1], band[2]]
+    x_all = np.concatenate([marks[0], *(x for x, _, _ in curves)])
+    y_all = np.concatenate([marks[1], *(y for _, y, _ in curves), *ends])
     low, high = np.array([x_all.min(), y_all.min()]), np.array([x_all.max(), y_all.max()])
     span = np.maximum(high - low, 1e-12)
 
@@ -195,9 +199,13 @@ def graph(
     if band is not None:
         x, lower = at(band[0], band[1])
         _, upper = at(band[0], band[2])
-        points = [f"{a:.1f},{b:.1f}" for a, b in zip(x, lower, strict=True)]
-        points += [f"{a:.1f},{b:.1f}" for a, b in zip(x[::-1], upper[::-1], strict=True)]
-        parts.append(f'<polygon points="{" ".join(points)}" fill="var(--accent)" fill-opacity="0.25"/>')
+        rim = [f"{a:.1f},{b:.1f}" for a, b in zip(x, lower, strict=True)]
+        rim += [f"{a:.1f},{b:.1f}" for a, b in zip(x[::-1], upper[::-1], strict=True)]
+        parts.append(f'<polygon points="{" ".join(rim)}" fill="var(--accent)" fill-opacity="0.25"/>')
+    parts += [
+        f'<circle cx="{a:.1f}" cy="{b:.1f}" r="2" fill="var(--accent)" fill-opacity="0.6"/>'
+        for a, b in zip(*at(*marks), strict=True)
+    ]
     parts += [curve_path(*at(x, y), f"stroke:{colour};stroke-width:1.6") for x, y, colour in curves]
     small = 'font-size="12" fill="var(--quiet)"'
     for share in (0.0, 0.5, 1.0):

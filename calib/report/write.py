@@ -18,6 +18,7 @@ from calib.report import colour_part, flash_part, lens_part, response_part, sens
 from calib.report.page import page, section, table, warnings
 from calib.report.part import UNKNOWN, Part, read_evidence
 from calib.response.save import response_evidence_path
+from calib.sensor.save import FLAT_SCHEMA, NOISE_SCHEMA, flat_evidence_path, noise_evidence_path
 from capture.atomic import atomic_write
 from capture.controls import MATTERING
 from capture.json_fields import Fields
@@ -85,8 +86,24 @@ def _parts(known: Calibration, path: Path) -> list[Part]:
             ),
         ),
         sensor_part.dark_part(known),
-        sensor_part.noise_part(known),
-        sensor_part.flat_part(known),
+        sensor_part.noise_part(
+            known,
+            _evidence(
+                noise_evidence_path(path),
+                NOISE_SCHEMA,
+                None if known.noise_shot is None else known.noise_shot.value,
+                lambda found: found.array("shot", (3,)),
+            ),
+        ),
+        sensor_part.flat_part(
+            known,
+            _evidence(
+                flat_evidence_path(path),
+                FLAT_SCHEMA,
+                None if known.flat_field is None else known.flat_field.value,
+                lambda found: found.array("terms", (None,)),
+            ),
+        ),
         colour_part.colour_part(
             known,
             _evidence(

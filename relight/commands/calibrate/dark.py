@@ -38,6 +38,7 @@ def run(args: argparse.Namespace) -> None:
     from calib.calibration import Calibration, Quantity, load_calibration, save_calibration
     from calib.errors import NoiseError
     from calib.sensor.noise import fit_dark, fit_noise
+    from calib.sensor.save import save_noise_evidence
     from calib.stills import read_stills
     from capture.controls import common_controls
 
@@ -49,7 +50,7 @@ def run(args: argparse.Namespace) -> None:
     darks = list(read_stills(args.source))
     dark = fit_dark(darks) if darks else None
     level = known.value("dark") if dark is None else dark.level
-    found = Calibration()
+    found, noise = Calibration(), None
     if dark is not None:
         about = f"{dark.frames} dark pictures of {', '.join(path.name for path in args.source)}"
         made_with = common_controls(still.controls for still in darks).mattering("dark")
@@ -70,6 +71,8 @@ def run(args: argparse.Namespace) -> None:
         )
         print(_describe_noise(noise, named))
     save_calibration(found, out)
+    if noise is not None:
+        save_noise_evidence(noise, out)
     print(f"saved       {out}")
     if dark is not None and known.response is not None and known.dark is None and (dark.level > 0.002).any():
         print(

@@ -30,6 +30,7 @@ def run(args: argparse.Namespace) -> None:
     """Finds the flat field and saves it."""
     from calib.calibration import Calibration, Quantity, load_calibration, save_calibration
     from calib.sensor.flat_field import fit_flat_field
+    from calib.sensor.save import save_flat_evidence
     from calib.stills import read_stills
     from capture.controls import common_controls
 
@@ -47,6 +48,7 @@ def run(args: argparse.Namespace) -> None:
     print(_describe(result, named))
     flat = Quantity.of(result.terms, "1", about, result.sigma, made_with)
     save_calibration(Calibration(flat_field=flat), out)
+    save_flat_evidence(result, out)
     print(f"saved       {out}")
 
 

@@ -86,13 +86,16 @@ def test_a_picture_that_is_no_flat_is_refused(flats, words):
         fit_flat_field(flats(), SRGB)
 
 
-def test_the_command_saves_what_it_finds(tmp_path, capsys):
+def test_the_command_saves_what_it_finds(tmp_path, capsys, read_page):
     folder = tmp_path / "flats"
     folder.mkdir()
     for seed in range(3):
         write_png(folder / f"{seed}.png", flat(seed).image)
     out = tmp_path / "calibration.json"
     assert main(["calibrate", "flat", str(folder), "--out", str(out)]) == 0
+    page = read_page(out)
+    assert "bowl of light" in page
+    assert "as if the terms were independent" not in page
     said = capsys.readouterr().out
     assert "in the corner" in said
     assert said.count("flat  ") == 3

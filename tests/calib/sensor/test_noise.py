@@ -157,7 +157,7 @@ def test_noise_that_a_camera_smooths_is_told():
     assert "goes together" in noise.warnings[0]
 
 
-def test_the_command_saves_what_it_finds(tmp_path, capsys):
+def test_the_command_saves_what_it_finds(tmp_path, capsys, read_page):
     for kind, stills in (("dark", dark_shots()), ("pairs", shots())):
         (tmp_path / kind).mkdir()
         for number, still in enumerate(stills):
@@ -168,6 +168,7 @@ def test_the_command_saves_what_it_finds(tmp_path, capsys):
     assert load_calibration(out).dark.value == pytest.approx(0.03, abs=0.001)
     other = tmp_path / "other.json"
     assert main(["calibrate", "dark", "--flats", str(tmp_path / "pairs"), "--out", str(other)]) == 0
+    assert "photon transfer" in read_page(other)
     assert "white is" in capsys.readouterr().out
     assert load_calibration(other).noise_shot.value == pytest.approx(1 / 6000, rel=0.03)
     assert main(["calibrate", "dark", "--out", str(out)]) == 1
