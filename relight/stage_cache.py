@@ -26,7 +26,7 @@ from capture.frame_record import FrameRecord
 from capture.json_fields import parse_json
 from capture.session import Session
 
-VERSIONS = {"poses": 1, "cloud": 1, "masks": 1, "scale": 1, "solve": 1}
+VERSIONS = {"poses": 1, "cloud": 1, "masks": 1, "scale": 1, "solve": 2}
 """Of the stages' methods; raising one has the stage done again."""
 
 _SCHEMA = 1
