@@ -33,20 +33,21 @@ _DRAWN = at_most(1e-3)  # splats fall off like exp(-u^2) of a place u that is kn
 _EDGE = at_most(0.01)
 _ONLY = (torch.float32,)
 Made = Callable[[torch.dtype], Portrait]
+"""A portrait in a precision."""
 
 
 def cases() -> Iterator[Case]:
     """All cases of this module."""
-    for stressed, made in _PORTRAITS.items():
+    for stressed, made in PORTRAITS.items():
         yield Case(MAPS, stressed, partial(_mapped, made, _CAMERA), _DRAWN)
     for stressed, camera in _VIEWS.items():
         yield Case(MAPS, stressed, partial(_mapped, _usual, camera), _DRAWN)
     yield Case(MAPS, "ten million points", partial(_many, _many_mapped), dtypes=_ONLY, long=True)
     for stressed, lit in _LIT.items():
         yield Case(SHADOWS, stressed, partial(_shadowed, _usual, lit), _EDGE)
-    for stressed, points in _HARDLY_A_HEAD.items():
+    for stressed, points in HARDLY_A_HEAD.items():
         for name in ("lamp before the head", "distant light", "many lights"):
-            shadowed = partial(_shadowed, partial(_of_points, points), _LIT[name])
+            shadowed = partial(_shadowed, partial(of_points, points), _LIT[name])
             yield Case(SHADOWS, f"{stressed}, {name}", shadowed, _EDGE)
     yield Case(SHADOWS, "ten million points", partial(_many, _many_shadowed), dtypes=_ONLY, long=True)
 
@@ -55,7 +56,8 @@ def _usual(dtype: torch.dtype) -> Portrait:
     return portrait(dtype=dtype)
 
 
-def _of_points(points: Floats, dtype: torch.dtype) -> Portrait:
+def of_points(points: Floats, dtype: torch.dtype) -> Portrait:
+    """A portrait of some points."""
     return portrait(dtype=dtype, points=points)
 
 
@@ -68,12 +70,12 @@ def _spaced(spacing: float, dtype: torch.dtype) -> Portrait:
     return replace(portrait(dtype=dtype), spacing=spacing)
 
 
-_PORTRAITS: dict[str, Made] = {
+PORTRAITS: dict[str, Made] = {
     "usual": _usual,
-    "one point": partial(_of_points, np.array([[0.0, 0.0, 0.1]])),
-    "points behind, at and beside the camera": partial(_of_points, around(_CAMERA)),
-    "every point ten times": partial(_of_points, np.repeat(0.1 * sphere_points(1000), 10, axis=0)),
-    "no point in the picture": partial(_of_points, 0.1 * sphere_points(500) + np.array([0.0, 0.0, 9.0])),
+    "one point": partial(of_points, np.array([[0.0, 0.0, 0.1]])),
+    "points behind, at and beside the camera": partial(of_points, around(_CAMERA)),
+    "every point ten times": partial(of_points, np.repeat(0.1 * sphere_points(1000), 10, axis=0)),
+    "no point in the picture": partial(of_points, 0.1 * sphere_points(500) + np.array([0.0, 0.0, 9.0])),
     "zero normals": partial(_times, normals_world=0.0),
     "black": partial(_times, albedo=0.0, room_radiance=0.0),
     "intensities times 1e-6": partial(_times, room_radiance=1e-6),
@@ -81,6 +83,7 @@ _PORTRAITS: dict[str, Made] = {
     "spacing of 1e-9 m": partial(_spaced, 1e-9),
     "spacing of 10 m": partial(_spaced, 10.0),
 }
+"""Such as nobody would take, by name."""
 
 _VIEWS = {
     "a camera within the head": looking_at_origin([0.0, 0.0, 1e-3], 64),
@@ -89,11 +92,12 @@ _VIEWS = {
     "a picture of one pixel": looking_at_origin([0.1, 0.05, 0.5], 1),
 }
 
-_HARDLY_A_HEAD = {
+HARDLY_A_HEAD = {
     "one point": np.array([[0.0, 0.0, 0.1]]),
     "copies of one point": np.zeros((50, 3)),
     "points on a line to the lamp": np.linspace([0.0, 0.0, 0.0], [0.0, 0.6, 0.8], 50),
 }
+"""Points that make no surface, by name."""
 
 
 def _mapped(made: Made, camera: Camera, dtype: torch.dtype) -> Measured:
