@@ -156,7 +156,8 @@ def fit(
                 progress=told,
             )
         with stages.stage("check"):
-            check = check_portrait(portrait, scene)
+            solve_check, check = check, check_portrait(portrait, scene)
+        warnings += _compared(check, solve_check)
 
     folder.mkdir(parents=True, exist_ok=True)
     for outdated in ("evaluation.json", "config.json"):  # they belong to the portrait that is replaced now
@@ -212,6 +213,16 @@ def _judged(check: SelfCheck, *, found: bool) -> list[str]:
     if not (check.psnr_db >= DOUBTED_DB and check.covered >= DOUBTED_COVER):
         return [f"Look twice: {said}; a head that moved, poses that are off or blur would show like that."]
     return []
+
+
+def _compared(refined: SelfCheck, solved: SelfCheck) -> list[str]:
+    """A sentence where a refinement shows the frames less well than what it began with."""
+    if refined.psnr_db >= solved.psnr_db:
+        return []
+    return [
+        f"The refinement gives its own frames back at {refined.psnr_db:.1f} dB, the photometric solve at "
+        f"{solved.psnr_db:.1f} dB: give it more time, or take --preset solve."
+    ]
 
 
 def _seconds_left(max_seconds: float | None, started_s: float, stages: Stages) -> float | None:

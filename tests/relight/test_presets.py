@@ -63,6 +63,8 @@ def test_the_refined_portrait_is_saved_with_its_decoder_and_settings(session):
     metrics = json.loads((folder / "metrics.json").read_text())
     assert "Refined." in metrics["warnings"]
     assert "refine" in metrics["seconds"]
+    # Half the albedo under the flash: the solve's own pictures were better, and that is said.
+    assert any("the photometric solve at" in sentence for sentence in metrics["warnings"])
 
 
 def test_a_second_fit_goes_on_from_the_checkpoint_unless_the_seed_is_another(session):
