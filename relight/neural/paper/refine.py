@@ -140,7 +140,7 @@ def _portrait(fit: PaperFit, solved: Portrait, watch: Stopwatch, said: list[str]
         "held_out_frames": [view.index for view in fit.checked],
         "held_out_db": [[step, round(ratio, 3)] for step, ratio in fit.held_out_db],
     }
-    warnings = list(said)
+    warnings = [*solved.info.get("warnings", ()), *said]
     if fit.step < fit.config.steps:
         warnings.append(
             f"The paper's fit was ended by its time, after {fit.step} of {fit.config.steps} steps."

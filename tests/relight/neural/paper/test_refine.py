@@ -26,6 +26,7 @@ class Steps:
 
 def test_the_portrait_has_the_network_and_says_how_it_came_about(scene, solved, config):
     told = []
+    solved = replace(solved, info={**solved.info, "warnings": ["The solve has a word."]})
     portrait = refine_paper(scene, solved, config=config, progress=lambda *each: told.append(each))
     assert portrait.decoder is not None
     assert len(portrait.decoder.descriptors) == len(portrait.points)
@@ -35,6 +36,7 @@ def test_the_portrait_has_the_network_and_says_how_it_came_about(scene, solved, 
     said = " ".join(portrait.info["warnings"])
     assert "VGG-16's weights were not given (--vgg FILE)" in said
     assert "No face is known" in said
+    assert "The solve has a word." in said
     assert told[0] == ("paper", 0.0)
     assert told[-1] == ("paper", 1.0)
     assert portrait.info["solver"] == solved.info["solver"]
