@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.sparse import csr_array, vstack
+from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
 from relight.tangents import tangents
@@ -70,7 +70,8 @@ class HeightField:
         transposed = differences.T.tocsr()
         self._differences = _Sparse(differences, points.device)
         self._transposed = _Sparse(transposed, points.device)
-        self._squared = _Sparse(transposed.power(2), points.device)
+        squares = csr_array((transposed.data**2, transposed.indices, transposed.indptr), transposed.shape)
+        self._squared = _Sparse(squares, points.device)
 
     def slopes(self, heights: torch.Tensor) -> torch.Tensor:
         """Slopes [2, P] of heights [P], along u and v."""
@@ -144,12 +145,11 @@ def _stacked(rows: list[NDArray[np.float32]], near: NDArray[np.int64]) -> csr_ar
     # 32-bit indices: half of what a product reads.
     own = np.arange(count, dtype=np.int32)[:, None]
     columns = np.concatenate([near.astype(np.int32), own], axis=1).ravel()
-    starts = np.arange(count + 1, dtype=np.int32) * np.int32(neighbours + 1)
-    parts = []
-    for row in rows:
-        values = np.concatenate([row, -row.sum(axis=1, keepdims=True)], axis=1).ravel()
-        parts.append(csr_array((values, columns, starts), shape=(count, count)))
-    return vstack(parts, format="csr")
+    starts = np.arange(len(rows) * count + 1, dtype=np.int32) * np.int32(neighbours + 1)
+    values = [np.concatenate([row, -row.sum(axis=1, keepdims=True)], axis=1).ravel() for row in rows]
+    return csr_array(
+        (np.concatenate(values), np.tile(columns, len(rows)), starts), shape=(len(rows) * count, count)
+    )
 
 
 class _Sparse:
@@ -196,7 +196,10 @@ def _conjugate_gradients(
         if inner(residual, residual) <= enough:
             break
         pulled = product(step)
-        length = slope / inner(step, pulled)
+        curvature = inner(step, pulled)
+        if curvature <= 0.0:  # the step has rounded to none
+            break
+        length = slope / curvature
         solution += length * step
         residual -= length * pulled
         preconditioned = residual / diagonal

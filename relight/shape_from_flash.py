@@ -12,6 +12,12 @@ Each round makes the model linear about the current normals (Gauss-Newton), take
 of the problem, and solves for the heights of all points at once. The cloud speaks twice: its heights are
 right to its noise, alike over centimetres, and its slopes are right but for features that smoothing took
 away, which is why large corrections of them count for less (Cauchy).
+
+What the model cannot explain of a point (hair, which is no surface; light from other parts of the subject) is
+that point's own noise: its residual tells how much its frames are to be believed.
+
+Corrections are found on a quarter of the points first: what is wide travels from neighbour to neighbour, and
+there in half as many steps of a quarter of the cost.
 """
 
 from __future__ import annotations
@@ -19,16 +25,23 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
+import numpy as np
 import torch
+from scipy.spatial import cKDTree
 
 from relight.height_field import HeightField, SlopeTerms
 from relight.reflectance import GRAZING, Reflectance
 
 _STEP = 1e-3  # of a cosine, for the reflectance's derivative
 _FLOOR = 0.004  # albedo that is as good as black
-_ALIKE = 180.0  # points of a smoothed cloud that share one error of height
+_ALIKE = 60.0  # points of a smoothed cloud that share one error of height: half of a smoothing disc
 _LEAST_NOISE = 0.1  # of a cloud, in spacings: what is moved by less cannot be told
 _ROBUST = 2  # reweightings of a point's albedo
+_SHARED = 2.0  # points that share one error of a picture: they lie closer than pixels, sampled between four
+_USUAL = 4.0  # frames whose word the subject's noise counts for in a point's own
+_COARSE = 2.0  # spacing of the points to begin with, in spacings
+_FEWEST = 4000  # points for which a coarse start is worth its while
+_SPREAD = 4  # coarse points that a point has its first height from
 _STEEPEST = 1.0  # slope of a correction: beyond 45 degrees it is another surface
 _CHUNK = 1 << 16
 
@@ -41,14 +54,18 @@ class ShapeConfig:
         slope_sigma: Standard deviation of the cloud's slopes about the truth, features included.
         bend_sigma: Standard deviation of the neighbours' height over a point's, in spacings: a surface is
             smooth.
-        rounds: Of linearising and solving.
-        iterations: Of conjugate gradients a round.
+        coarse_rounds: Of linearising and solving, on a quarter of the points.
+        coarse_iterations: Of conjugate gradients in each of them.
+        rounds: On all points.
+        iterations: In each of them.
     """
 
     slope_sigma: float = 0.25
     bend_sigma: float = 0.05
-    rounds: int = 4
-    iterations: int = 40
+    coarse_rounds: int = 3
+    coarse_iterations: int = 40
+    rounds: int = 1
+    iterations: int = 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,6 +85,12 @@ class FlashResponses:
     to_light: torch.Tensor
     gloss: torch.Tensor
     noise: float
+
+    def of(self, some: torch.Tensor) -> FlashResponses:
+        """Those of some of the points, [N] indices."""
+        return FlashResponses(
+            self.response[:, some], self.weight[:, some], self.to_light[:, some], self.gloss[some], self.noise
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,28 +132,86 @@ def refine_shape(
     Returns:
         The shape; as given where no flash frame saw the points.
     """
-    field = HeightField(points, normals_world, spacing)
-    heights = torch.zeros_like(points[:, 0])
-    normals = normals_world
     anchor = 1.0 / (_ALIKE * max(cloud_noise, _LEAST_NOISE * spacing) ** 2)
-    for _ in range(config.rounds):
-        slopes = field.slopes(heights)
-        terms = _slope_terms(field, flash, reflectance, normals, slopes)
-        trust = 1.0 / (1.0 + (slopes * slopes).sum(dim=0) / (2.0 * config.slope_sigma) ** 2)
-        trust = trust / config.slope_sigma**2
-        terms = SlopeTerms(terms.uu + trust, terms.uv, terms.vv + trust, terms.right)
-        heights = field.fit(
-            terms,
-            anchor=anchor,
-            bending=1.0 / config.bend_sigma**2,
-            start=heights,
-            iterations=config.iterations,
-        )
-        normals = field.normals(heights)
+    heights = torch.zeros_like(points[:, 0])
+    if len(points) >= _FEWEST and config.coarse_rounds > 0:
+        few = _thinned(points, _COARSE * spacing)
+        coarse = HeightField(points[few], normals_world[few], _COARSE * spacing)
+        level = _Level(config.coarse_rounds, config.coarse_iterations, _COARSE * config.bend_sigma)
+        found = _fit(coarse, flash.of(few), reflectance, heights[few], anchor, config.slope_sigma, level)
+        heights = _carried(coarse, found, points[few], points, _COARSE * spacing)
+    field = HeightField(points, normals_world, spacing)
+    level = _Level(config.rounds, config.iterations, config.bend_sigma)
+    heights = _fit(field, flash, reflectance, heights, anchor, config.slope_sigma, level)
+    normals = field.normals(heights)
     # Where a correction is no small one it is no correction: edges of the cloud, where neighbours are few.
     sane = (field.slopes(heights) ** 2).sum(dim=0) < _STEEPEST**2
     normals = torch.where(sane[:, None], normals, normals_world)
     return RefinedShape(points + heights[:, None] * normals_world, normals, heights)
+
+
+@dataclass(frozen=True)
+class _Level:
+    """How long to solve at one spacing, and how smooth corrections are there."""
+
+    rounds: int
+    iterations: int
+    bend_sigma: float
+
+
+def _fit(
+    field: HeightField,
+    flash: FlashResponses,
+    reflectance: Reflectance,
+    heights: torch.Tensor,
+    anchor: float,
+    slope_sigma: float,
+    level: _Level,
+) -> torch.Tensor:
+    """Heights [P] that explain the shading, from some to begin with."""
+    for _ in range(level.rounds):
+        slopes, normals = field.slopes(heights), field.normals(heights)
+        terms = _slope_terms(field, flash, reflectance, normals, slopes, slope_sigma)
+        trust = 1.0 / (1.0 + (slopes * slopes).sum(dim=0) / (2.0 * slope_sigma) ** 2)
+        trust = trust / slope_sigma**2
+        heights = field.fit(
+            SlopeTerms(terms.uu + trust, terms.uv, terms.vv + trust, terms.right),
+            anchor=anchor,
+            bending=1.0 / level.bend_sigma**2,
+            start=heights,
+            iterations=level.iterations,
+        )
+    return heights
+
+
+def _thinned(points: torch.Tensor, cell: float) -> torch.Tensor:
+    """Indices of the first of the points in each cell of a grid."""
+    x, y, z = ((points - points.amin(dim=0)) / cell).long().T
+    # One number a cell: unique rows take ten times as long.
+    _, member = torch.unique((x * (int(y.max()) + 1) + y) * (int(z.max()) + 1) + z, return_inverse=True)
+    first = member.new_full((int(member.max()) + 1,), len(points))
+    first.scatter_reduce_(0, member, torch.arange(len(points), device=points.device), "amin")
+    return first.sort().values
+
+
+def _carried(
+    coarse: HeightField, heights: torch.Tensor, places: torch.Tensor, points: torch.Tensor, spacing: float
+) -> torch.Tensor:
+    """Heights [P] of points from those of coarse points at places [N, 3], along their slopes."""
+    count = min(_SPREAD, len(places))
+    distances, near = cKDTree(places.cpu().numpy()).query(
+        points.cpu().numpy(), k=list(range(1, count + 1)), workers=-1
+    )
+    weight = torch.from_numpy(np.exp(-0.5 * (distances / spacing) ** 2)).to(points)
+    slope_u, slope_v = coarse.slopes(heights)
+    slant = slope_u[:, None] * coarse.u + slope_v[:, None] * coarse.v
+    total, result = torch.zeros_like(points[:, 0]), torch.zeros_like(points[:, 0])
+    for k in range(count):
+        index = torch.from_numpy(near[:, k]).to(points.device)
+        height = heights[index] + ((points - places[index]) * slant[index]).sum(dim=1)
+        result += weight[:, k] * height
+        total += weight[:, k]
+    return result / total.clamp(min=1e-12)
 
 
 def _slope_terms(
@@ -139,6 +220,7 @@ def _slope_terms(
     reflectance: Reflectance,
     normals: torch.Tensor,
     slopes: torch.Tensor,
+    slope_sigma: float,
 ) -> SlopeTerms:
     """What the flash frames say of the slopes [2, P], linear about normals [P, 3] that have these slopes."""
     uu, uv, vv = (torch.empty_like(slopes[0]) for _ in range(3))
@@ -165,11 +247,19 @@ def _slope_terms(
         own = (precision * diffuse * diffuse).sum(dim=0).clamp(min=1e-6)
         cross_u, cross_v = ((precision * diffuse * by).sum(dim=0) / own for by in (by_u, by_v))
         by_u, by_v = by_u - cross_u * diffuse, by_v - cross_v * diffuse
-        uu[part], vv[part] = (precision * by_u**2).sum(dim=0), (precision * by_v**2).sum(dim=0)
-        uv[part] = (precision * by_u * by_v).sum(dim=0)
+        square_u, square_v = (precision * by_u**2).sum(dim=0), (precision * by_v**2).sum(dim=0)
+        cross = (precision * by_u * by_v).sum(dim=0)
+        pull_u, pull_v = (precision * by_u * left).sum(dim=0), (precision * by_v * left).sum(dim=0)
+        # What slopes within the cloud's spread would explain of the residual is no noise.
+        a, c = square_u + slope_sigma**-2, square_v + slope_sigma**-2
+        explained = (c * pull_u**2 - 2.0 * cross * pull_u * pull_v + a * pull_v**2) / (a * c - cross**2)
+        noise = ((precision * left * left).sum(dim=0) - explained).clamp(min=0.0)
+        frames = (robust.clamp(max=1.0).sum(dim=0) - 2.0).clamp(min=0.0)
+        belief = (_USUAL + frames) / (_USUAL + noise) / _SHARED
+        uu[part], uv[part], vv[part] = belief * square_u, belief * cross, belief * square_v
         along_u, along_v = slopes[:, part]
-        right[0, part] = (precision * by_u * left).sum(dim=0) + uu[part] * along_u + uv[part] * along_v
-        right[1, part] = (precision * by_v * left).sum(dim=0) + uv[part] * along_u + vv[part] * along_v
+        right[0, part] = belief * pull_u + uu[part] * along_u + uv[part] * along_v
+        right[1, part] = belief * pull_v + uv[part] * along_u + vv[part] * along_v
     return SlopeTerms(uu, uv, vv, right)
 
 
