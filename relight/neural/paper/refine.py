@@ -75,7 +75,9 @@ def refine_paper(
     for sentence in said:
         log.info(sentence)
     fit = PaperFit(scene, solved, config, _perceptual(config, scene.device), face, seed)
-    went_on = checkpoint is not None and fit.resume(checkpoint)
+    if checkpoint is not None:
+        fit.resume(checkpoint)
+    first_step = fit.step
 
     def portrait() -> Portrait:
         return _portrait(fit, solved, watch, said)
@@ -99,10 +101,10 @@ def refine_paper(
         return _with_word(
             solved, "There was no time for a step of the paper's fit: this is the photometric solve."
         )
-    if checkpoint is not None and (fit.step < config.steps or not went_on):
-        fit.save(checkpoint)
     if not fit.held_out_db or fit.held_out_db[-1][0] != fit.step:
         fit.look_at_held_out()
+    if checkpoint is not None and fit.step > first_step:
+        fit.save(checkpoint)
     progress("paper", 1.0)
     return portrait()
 

@@ -55,7 +55,10 @@ def test_a_fit_that_was_stopped_by_its_time_goes_on_to_the_very_same_portrait(
         np.testing.assert_array_equal(again.decoder.tensors()[name], values, err_msg=name)
     np.testing.assert_array_equal(again.albedo, whole.albedo)
     # A fit that has ended is not fitted on.
+    ended = (tmp_path / "state.json").read_text()
+    assert '"step": 6' in ended
     assert refine_paper(scene, solved, config=config, checkpoint=tmp_path).info["refinement"]["steps"] == 6
+    assert (tmp_path / "state.json").read_text() == ended
 
 
 def test_without_time_for_a_step_it_is_the_solve_and_that_is_said(scene, solved, config):
