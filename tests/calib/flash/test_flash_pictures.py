@@ -20,6 +20,7 @@ from calib.flash.boards import LitBoard
 from calib.flash.pairs import FlashPair, LinearPicture, open_pairs, pulses_of
 from calib.flash.samples import Refusal, collect_boards, lens_vector, lit_board
 from calib.flash.save import flash_evidence_path
+from capture.controls import Controls
 from capture.frame_record import FrameRecord
 from capture.images import write_png
 from capture.session import Session
@@ -222,6 +223,8 @@ def test_a_session_is_read_as_a_folder_is_and_keeps_its_other_entries(tmp_path, 
     assert one.flash_offset_cam_m.value == pytest.approx(RIG.offset_m, abs=3e-3)
     assert one.intrinsics is not None
     assert one.flat_field is not None
+    assert one.flash_strength.made_with == Controls(exposure_s=0.01)
+    assert one.flash_offset_cam_m.made_with is None  # it holds for every setting
 
 
 def test_without_a_flat_field_the_falloff_is_named_as_holding_the_lens_too(tmp_path, pairs, capsys):

@@ -13,6 +13,7 @@ from calib.response.check import compare_opencv, nearest_curve
 from calib.response.fit import fit_response
 from calib.response.groups import SweepFrame, gather_groups, grouped_median
 from calib.stills import read_stills
+from capture.controls import Controls
 from capture.errors import SourceError
 from capture.frame_record import FrameRecord
 from capture.images import write_jpeg, write_png
@@ -276,6 +277,7 @@ def test_exif_tells_the_exposure(tmp_path):
     picture.write_bytes(data[:2] + b"\xff\xe1" + struct.pack(">H", len(block) + 2) + block + data[2:])
     (still,) = read_stills([picture])
     assert still.exposure_s == pytest.approx(2 / 50)  # 1/50 s at ISO 200, as ISO 100
+    assert still.controls == Controls(width=32, height=32, exposure_s=1 / 50, gain=2.0)
 
 
 @pytest.mark.parametrize(

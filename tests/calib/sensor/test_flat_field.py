@@ -7,6 +7,7 @@ from calib.calibration import load_calibration
 from calib.errors import FlatFieldError
 from calib.sensor.flat_field import fit_flat_field
 from calib.stills import Still
+from capture.controls import Controls
 from capture.images import write_png
 from capture.response import Response
 from capture.sim.sensor import SensorConfig
@@ -102,6 +103,8 @@ def test_the_command_saves_what_it_finds(tmp_path, capsys, read_page):
     found = load_calibration(out).flat_field
     assert 1 + found.value.sum() == pytest.approx(1 + TERMS.sum(), abs=0.002)
     assert "srgb (no response is known)" in found.source
+    height, width = flat(0).image.shape[:2]
+    assert found.made_with == Controls(width=width, height=height)
     write_png(folder / "3.png", flat(3, texture=0.05).image)
     assert main(["calibrate", "flat", str(folder), "--out", str(out)]) == 1
     assert "3.png does not show a plain surface" in capsys.readouterr().err
