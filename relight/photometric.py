@@ -33,6 +33,7 @@ absolute; else a scale has to be chosen: the brightest twentieth of the points t
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 
@@ -190,10 +191,11 @@ def solve(scene: Scene, config: SolveConfig = SolveConfig(), progress: Progress 
     gauge, warnings = _gauge(albedo[known].mean(dim=1), measured.scale, measured.level)
     albedo = (albedo * gauge).clamp(min=0.0)
     c_room, shading = _split_room(room, albedo, information > config.known)
-    normal_sigma = _normal_sigma(information, relative, config.normal_sigma_rad)
+    alike = _alike(flash, reflectance)
+    normal_sigma = _normal_sigma(information / alike, relative, config.normal_sigma_rad)
     # An error of the normal is one of the cosine, by the tangent, whose square is about 0.5, and so of the
     # albedo.
-    sigma = (sigma**2 + 0.5 * (normal_sigma * albedo.mean(dim=1) / gauge) ** 2).sqrt()
+    sigma = (sigma**2 * alike + 0.5 * (normal_sigma * albedo.mean(dim=1) / gauge) ** 2).sqrt()
     share = information / config.known
     portrait = Portrait(
         points=points,
@@ -622,6 +624,22 @@ def _split_room(
     shading = (room * weight).sum(dim=1) / (weight * weight).sum(dim=1).clamp(min=1e-12)
     top = torch.quantile(_sampled(shading[used]), 0.99).clamp(min=1e-6)
     return colour * top, (shading / top).clamp(0.0, 1.0)
+
+
+def _alike(flash: _Flash, reflectance: Reflectance) -> torch.Tensor:
+    """How many of the flash frames that see a point say the same of it [P], at least 1.
+
+    What the model leaves is no noise: a highlight, a bounce or a fold errs alike in frames whose light comes
+    from about the same side. They count for one within the width of the subject's gloss, which is the
+    narrowest of these.
+    """
+    lit = flash.weight.sum(dim=1, keepdim=True).clamp(min=1e-9)
+    directions = (flash.weight[..., None] * flash.to_light).sum(dim=1) / lit
+    directions = torch.nn.functional.normalize(directions, dim=1)
+    angle = torch.acos((directions @ directions.T).clamp(-1.0, 1.0)).fill_diagonal_(0.0)
+    share = torch.exp(-0.5 * (angle / math.atan(reflectance.alpha)) ** 2)
+    frames = (flash.weight**2).sum(dim=0)
+    return (((share @ flash.weight) * flash.weight).sum(dim=0) / frames.clamp(min=1e-9)).clamp(min=1.0)
 
 
 def _normal_sigma(information: torch.Tensor, relative: float, prior_sigma: float) -> torch.Tensor:

@@ -127,8 +127,10 @@ def test_standard_errors_are_those_of_the_errors(frames, cloud, noise):
     albedo_ratio = (
         errors.product.mean(axis=1) / (portrait.albedo_sigma / portrait.albedo.mean(dim=1))[known].numpy()
     )
-    # Errors of a surface and of interpolation are no noise; the estimates may be a third off either way.
-    assert 0.6 < spread(albedo_ratio) < 1.6
+    # Errors of a surface and of interpolation are no noise; the estimates may be a third off either way. What
+    # the model leaves on a real subject is common to frames from one side; this one has noise alone, which is
+    # then overstated by the root of their number, about 1.5.
+    assert 0.4 < spread(albedo_ratio) < 1.6
     # The angle of two components, each with the standard error: rms sqrt(2). The prior of 0.06 rad is wider
     # than this cloud deserves, so the ratio may be well below it, but not above.
     normal_ratio = errors.normals_rad / portrait.normal_sigma_rad[known].numpy()
