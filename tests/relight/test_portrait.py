@@ -157,7 +157,7 @@ def test_an_impossible_entry_is_refused(saved, key, value):
 
 def test_a_missing_entry_is_refused(saved):
     content = json.loads((saved / FIELDS_FILE).read_text())
-    for key in content:
+    for key in content.keys() - {"room_gloss"}:  # the first portraits of this version have none
         (saved / FIELDS_FILE).write_text(json.dumps({k: v for k, v in content.items() if k != key}))
         refused(saved)
 

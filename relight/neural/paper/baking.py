@@ -40,8 +40,8 @@ def baked(
         views: Frames to take the maps of.
 
     Returns:
-        A portrait with the decoder. Its sigmas are what the frames disagree by; its reflectance is Lambert's,
-        its flash where the lens is, as the paper has them.
+        A portrait with the decoder. Its sigmas are what the frames disagree by; its reflectance is Lambert's
+        under the flash and in the room, its flash where the lens is, as the paper has them.
     """
     points = solved.points
     weight = points.new_zeros(len(points))
@@ -79,6 +79,7 @@ def baked(
         c_flash=_vector(c_flash),
         flash_offset_cam_m=(0.0, 0.0, 0.0),
         reflectance=Reflectance(),
+        room_gloss=None,
         decoder=decoder,
     )
 

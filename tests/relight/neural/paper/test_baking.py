@@ -59,6 +59,7 @@ def test_points_that_are_seen_have_the_maps_values(scene, solved, views):
     np.testing.assert_allclose(portrait.c_flash, C_FLASH, rtol=1e-6)
     assert portrait.flash_offset_cam_m == (0.0, 0.0, 0.0)
     assert portrait.reflectance.f0 == portrait.reflectance.retro == 0.0
+    assert portrait.room_gloss is None
 
 
 def test_points_that_are_not_seen_keep_the_solves_in_the_new_scale(scene, solved, views):

@@ -33,6 +33,8 @@ def test_its_maps_have_the_views_size_and_are_0_where_the_mask_is(portrait):
     maps = render_maps(portrait, CAMERA)
     for field in fields(Maps):
         values = getattr(maps, field.name)
+        if values is None:  # what only other decoders give
+            continue
         assert values.shape[:2] == (80, 80)
         assert bool(values.isfinite().all())
         if field.name != "point_ids":
