@@ -23,7 +23,8 @@ if TYPE_CHECKING:
     from relight.stages import Progress
 
 EXAMPLE = """relight fit VID_20261102_101530.mp4
-  relight fit S --preset solve --max-seconds 60"""
+  relight fit S --preset solve --max-seconds 60
+  relight fit S --preset paper --max-seconds 3600 --set precision=bfloat16"""
 
 
 class FitError(RelightError):
