@@ -25,7 +25,7 @@ _COMMANDS = {
     "report": ("relight.commands.report", "write report.html of a portrait again"),
     "calibrate": (
         "relight.commands.calibrate",
-        "print a board, and find a camera's lens from pictures of it",
+        "what a camera and its lamp really do, part by part, and a page to judge it by",
     ),
     "doctor": (
         "relight.commands.doctor",

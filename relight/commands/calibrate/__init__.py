@@ -34,7 +34,9 @@ EXAMPLE = (
     "relight calibrate board --out board.pdf\n"
     "  relight calibrate intrinsics VID_20261102_101530.mp4 --board board.json --out calibration.json\n"
     "  relight calibrate response --camera /dev/video0 --out calibration.json\n"
-    "  relight calibrate flash SESSION --board board.json --calibration calibration.json"
+    "  relight calibrate colour SESSION --out calibration.json\n"
+    "  relight calibrate flash SESSION --board board.json --calibration calibration.json\n"
+    "  relight calibrate report calibration.json"
 )
 
 
