@@ -14,8 +14,8 @@ no-flash frame a point shows its room radiance; a flash frame adds
 3. normals: robust least squares for b = albedo * n under the frames' light directions (Woodham 1980), with
    the geometric normal as a prior in the directions that the lights do not span. The prior's weight is the
    ratio of the two variances, the photometric one measured from the residual;
-   or, with `SolveConfig.shape`, as those of a surface that moves until its shading fits
-   (`relight.shape_from_flash`), on which steps 1 and 2 are then done again;
+   or, with `SolveConfig.shape`, as those of a surface that bends until its shading fits
+   (`relight.shape_from_flash`), with which steps 1 and 2 are then done again;
 4. albedo: robust least squares per channel;
 5. points that the flash did not reach are filled, on a face from its other side (`relight.mirror_infill`),
    else from their neighbours (`relight.infill`).
@@ -155,11 +155,13 @@ def solve(scene: Scene, config: SolveConfig = SolveConfig(), progress: Progress 
         scene.points.cpu().numpy(), normals_given, [view.camera for view in scene.views], config.cloud
     )
     progress("cloud", 1.0)
-    carved = None
+    observations = observe_points(scene, surface, progress)
+    progress("solve", 0.0)
     if config.shape is not None:
-        measured = _measure(scene, surface, replace(config, room_gloss=False), progress)
-        surface, carved = _shaped(surface, measured, config.shape, progress), measured.on_subject
-    measured = _measure(scene, surface, config, progress, carved)
+        measured = _measure(scene, surface, observations, replace(config, room_gloss=False))
+        surface = _shaped(surface, measured, config.shape, progress)
+        progress("solve", 0.0)
+    measured = _measure(scene, surface, observations, config)
     flash, relative, reflectance = measured.flash, measured.relative, measured.reflectance
     points = torch.from_numpy(surface.points).to(scene.device)
     prior = torch.from_numpy(surface.normals_world).to(scene.device)
@@ -263,27 +265,18 @@ class _Measured:
 
 
 def _measure(
-    scene: Scene,
-    surface: SurfaceCloud,
-    config: SolveConfig,
-    progress: Progress,
-    on_subject: torch.Tensor | None = None,
+    scene: Scene, surface: SurfaceCloud, observations: Observations, config: SolveConfig
 ) -> _Measured:
-    """Samples the frames at a surface and fits what all its points share.
-
-    `on_subject` [P] says what the masks leave of it; None = it is told from them.
+    """Fits what all points of a surface share to what the frames show of them.
 
     Raises:
         PlanError: The frames do not show the surface, or are no brighter with the flash.
     """
-    observations = observe_points(scene, surface, progress)
-    progress("solve", 0.0)
     points = torch.from_numpy(surface.points).to(scene.device)
     normals = torch.from_numpy(surface.normals_world).to(scene.device)
     # What masks carve away takes no part; it is dropped at the end, for a copy of the observations would be
     # large.
-    if on_subject is None:
-        on_subject = observations.outside <= _OUTSIDE_LIMIT
+    on_subject = observations.outside <= _OUTSIDE_LIMIT
     observations.cosine.mul_(on_subject)
     if not bool((observations.cosine > 0).any()):
         raise PlanError(
@@ -337,7 +330,7 @@ def _measure(
 def _shaped(
     surface: SurfaceCloud, measured: _Measured, config: ShapeConfig, progress: Progress
 ) -> SurfaceCloud:
-    """The surface that explains the shading under the flash."""
+    """The surface with the normals that explain the shading under the flash."""
     progress("shape", 0.0)
     flash = measured.flash
     shape = refine_shape(
@@ -352,8 +345,7 @@ def _shaped(
         config=config,
     )
     progress("shape", 1.0)
-    points, normals = (part.cpu().numpy() for part in (shape.points, shape.normals_world))
-    return replace(surface, points=points, normals_world=normals)
+    return replace(surface, normals_world=shape.normals_world.cpu().numpy())
 
 
 def _room_radiance(observations: Observations) -> tuple[torch.Tensor, torch.Tensor]:

@@ -16,6 +16,9 @@ away, which is why large corrections of them count for less (Cauchy).
 What the model cannot explain of a point (hair, which is no surface; light from other parts of the subject) is
 that point's own noise: its residual tells how much its frames are to be believed.
 
+Only the normals are to be believed. Slopes that err alike over a centimetre sum up to heights that err by
+more than the cloud does: points that follow them blur outlines and pictures.
+
 Corrections are found on a quarter of the points first: what is wide travels from neighbour to neighbour, and
 there in half as many steps of a quarter of the cost.
 """
@@ -98,14 +101,12 @@ class RefinedShape:
     """The surface that fits.
 
     Attributes:
-        points: [P, 3] moved along their normals.
         normals_world: [P, 3] unit.
-        moved: [P], by how much, world units.
+        heights: [P], world units, over the cloud's points along its normals.
     """
 
-    points: torch.Tensor
     normals_world: torch.Tensor
-    moved: torch.Tensor
+    heights: torch.Tensor
 
 
 def refine_shape(
@@ -118,7 +119,7 @@ def refine_shape(
     cloud_noise: float,
     config: ShapeConfig = ShapeConfig(),
 ) -> RefinedShape:
-    """Moves the points of a smooth cloud such that their shading under the flash is explained.
+    """Heights over a smooth cloud, and their normals, such that the shading under the flash is explained.
 
     Args:
         points: [P, 3], world.
@@ -147,7 +148,7 @@ def refine_shape(
     # Where a correction is no small one it is no correction: edges of the cloud, where neighbours are few.
     sane = (field.slopes(heights) ** 2).sum(dim=0) < _STEEPEST**2
     normals = torch.where(sane[:, None], normals, normals_world)
-    return RefinedShape(points + heights[:, None] * normals_world, normals, heights)
+    return RefinedShape(normals, heights)
 
 
 @dataclass(frozen=True)
