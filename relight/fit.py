@@ -115,7 +115,7 @@ def fit(
         with stages.stage("plan"):
             plan = make_plan(opened, forced, max_seconds, geometry).after(plan)
         plan.check()
-    config = SolveConfig(mirror=plan.runs("face_prior"))
+    config = SolveConfig(mirror=plan.runs("face_prior"), **chosen.solve)
     folder = opened.portraits_dir / name
     cache = StageCache(opened)
     solve_key = _solve_key(opened, cache, plan, config, geometry.face, torch_device)

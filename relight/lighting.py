@@ -134,7 +134,7 @@ class CaptureLight:
         if self.flash_offset_cam_m is not None:
             cam_from_world = surface.vector(self.camera.cam_from_world[:3, :3])
             position = position + surface.vector(self.flash_offset_cam_m) @ cam_from_world
-        radiance = surface.vector(self.c_flash) * self.response(surface, position)
+        radiance = surface.vector(self.c_flash) * self.response(surface, position) * surface.flash_gain
         if self.lamp is None or self.lamp.falloff == 0:
             return radiance
         to_light, _ = direction_to(surface.points, position)

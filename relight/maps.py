@@ -59,6 +59,7 @@ class Maps:
         point_ids: [H, W] int64, a point of the portrait seen in or near the pixel, -1 off the subject.
         flash_radiance: [H, W, 3] linear radiance that the camera's own flash adds, where a decoder has a
             light model of its own for it; None = it follows from the other maps.
+        flash_gain: [H, W, 3] factor on what follows from the other maps; None = 1.
     """
 
     albedo: torch.Tensor
@@ -72,6 +73,7 @@ class Maps:
     gloss: torch.Tensor
     point_ids: torch.Tensor
     flash_radiance: torch.Tensor | None = None
+    flash_gain: torch.Tensor | None = None
 
 
 def render_maps(portrait: Portrait, camera: Camera) -> Maps:

@@ -7,12 +7,13 @@ of the lights. The module of a refinement is imported when it is asked for.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from importlib import import_module
 from typing import Any
 
 from relight.errors import PlanError
 from relight.portrait import Portrait
+from relight.shape_from_flash import ShapeConfig
 
 Refine = Callable[..., Portrait]
 """refine(scene: Scene, solved: Portrait, *, config, seconds: float | None, face: FacePrior | None,
@@ -33,10 +34,12 @@ class Preset:
         refine: A `Refine`; None = the solve alone.
         make_config: Without arguments gives its configuration, a frozen dataclass whose fields are its
             arguments; None = it has none.
+        solve: What its solve does beyond the plain one, arguments of `SolveConfig`.
     """
 
     refine: str | None = None
     make_config: str | None = None
+    solve: Mapping[str, Any] = field(default_factory=dict)
 
     def load_refine(self) -> Refine | None:
         """The refinement, if there is one."""
@@ -56,29 +59,26 @@ class Preset:
         return usual if self.make_config is None else _loaded(self.make_config)(**settings)
 
 
+_REFINED = "relight.neural.refined.refine:refine_solved"
+_SHAPED = {"shape": ShapeConfig(), "room_gloss": True}
+
 PRESETS: dict[str, Preset] = {
     "solve": Preset(),
+    "fast": Preset(_REFINED, "relight.neural.refined.config:fast_config", _SHAPED),
+    "balanced": Preset(_REFINED, "relight.neural.refined.config:balanced_config", _SHAPED),
     "paper": Preset("relight.neural.paper.refine:refine_paper", "relight.neural.paper.config:PaperConfig"),
 }
-
-PRESETS_TO_COME = ("fast", "balanced")
 
 
 def chosen_preset(name: str) -> Preset:
     """The preset of a name.
 
     Raises:
-        PlanError: There is none, or not yet.
+        PlanError: There is none.
     """
     if name in PRESETS:
         return PRESETS[name]
-    if name in PRESETS_TO_COME:
-        raise PlanError(
-            f"The preset {name!r} is a neural refinement, which is still to come; use --preset solve, "
-            "the photometric solve that it will start from."
-        )
-    known = ", ".join((*PRESETS, *PRESETS_TO_COME))
-    raise PlanError(f"There is no preset {name!r}; known are {known}, and {', '.join(PRESETS)} today.")
+    raise PlanError(f"There is no preset {name!r}; known are {', '.join(PRESETS)}.")
 
 
 def _loaded(place: str) -> Any:

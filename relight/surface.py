@@ -28,7 +28,8 @@ class SurfaceMaps(Protocol):
 
     Maps may also have a `room_radiance` [..., 3], linear: what the room's light makes of the surface, in
     colour. It then takes the place of albedo * C_room * shading. Likewise a `flash_radiance` [..., 3], what
-    the camera's own flash adds. And a `gloss` [...], a factor on the gloss of a reflectance.
+    the camera's own flash adds, or a `flash_gain` [..., 3], a factor on it. And a `gloss` [...], a factor on
+    the gloss of a reflectance.
     """
 
     @property
@@ -110,6 +111,12 @@ class Surface:
         """[P, 3], linear, under the room's light; None where the maps know only a grey shading."""
         radiance = getattr(self._maps, "room_radiance", None)
         return None if radiance is None else self._gather(radiance)
+
+    @cached_property
+    def flash_gain(self) -> Tensor | float:
+        """[P, 3], factor on the radiance of the camera's own flash; 1 where the maps know of none."""
+        gain = getattr(self._maps, "flash_gain", None)
+        return 1.0 if gain is None else self._gather(gain)
 
     @cached_property
     def flash_radiance(self) -> Tensor | None:

@@ -15,6 +15,7 @@ from relight.stress import (
     networks,
     observing,
     projecting,
+    refining,
     reflecting,
     relighting,
     rendering,
@@ -35,6 +36,7 @@ _MODULES: tuple[Callable[[], Iterator[Case]], ...] = (
     measures.cases,
     networks.cases,
     training.cases,
+    refining.cases,
     gradients.cases,
     drift.cases,
 )

@@ -14,8 +14,7 @@ from relight.cli import _COMMANDS, main
 SENTENCES = {
     "no session": (["plan", "nowhere"], "nowhere is no session"),
     "nothing to import": (["fit", "nowhere"], "nowhere does not exist"),
-    "no such preset": (["fit", "S", "--preset", "magic"], "known are solve, paper, fast, balanced"),
-    "a preset to come": (["fit", "S", "--preset", "fast"], "still to come"),
+    "no such preset": (["fit", "S", "--preset", "magic"], "known are solve, fast, balanced, paper"),
     "no setting of a preset": (["fit", "S", "--steps", "9"], "no setting 'steps'; it has none"),
     "a setting of another form": (["fit", "S", "--set", "crop"], "--set crop must be NAME=VALUE"),
     "no weights of VGG": (["fit", "S", "--vgg", "no.pth"], "no.pth does not exist; name what --vgg"),

@@ -10,7 +10,7 @@ from relight.decoder import KINDS
 from relight.errors import PlanError
 from relight.fit import fit
 from relight.portrait import load_portrait
-from relight.presets import PRESETS, PRESETS_TO_COME, Preset, chosen_preset
+from relight.presets import PRESETS, Preset, chosen_preset
 
 PLAIN = Preset("plain_decoder:refine", "plain_decoder:PlainConfig")
 
@@ -36,10 +36,6 @@ def test_every_preset_can_be_loaded(name):
     preset = chosen_preset(name)
     assert (preset.load_refine() is None) == (preset.refine is None)
     assert (preset.config({}) is None) == (preset.make_config is None)
-
-
-def test_no_preset_is_both_there_and_to_come():
-    assert not set(PRESETS) & set(PRESETS_TO_COME)
 
 
 def test_an_unknown_setting_is_refused_with_those_that_there_are():
