@@ -27,6 +27,7 @@ BANDS = 5
 
 _SMOOTH = 1e-3  # weight, relative to the data's, of a coefficient's square times (l (l + 1))^2 + 1
 _MODEL = 0.05  # relative deviation that counts as large
+_BRIGHT = 4.0  # coefficient: an even room as bright as white has 3.5; bounds what noise makes of near views
 _FLOOR = 0.02  # radiance under which deviations are no longer told relative to it
 _ITERATIONS = 3
 _SAMPLE = 50_000
@@ -150,7 +151,7 @@ def fit_room_gloss(
         usual = float(left.diagonal().mean())
         if not usual > 0:
             return None
-        left += torch.diag(_SMOOTH * usual * roughness.double())
+        left += torch.diag((_SMOOTH * usual + (_MODEL / _BRIGHT) ** 2) * roughness.double())
         coefficients = torch.linalg.solve(left, right).to(points)
     return RoomGloss(coefficients)
 
