@@ -116,10 +116,16 @@ class RefinedDecoder(Decoder):
             raise ValueError(f"pixels_a_unit is {pixels}")
         if settings["precision"] not in PRECISIONS:
             raise ValueError(f"precision {settings['precision']!r} is unknown")
-        network = RefinedNetwork(count, [int(width) for width in settings["widths"]])
+        if any(values.dtype != torch.float32 for values in tensors.values()):
+            raise ValueError("not all of its tensors are of float32")
+        widths = [int(width) for width in settings["widths"]]
+        if min(widths, default=0) < 1:
+            raise ValueError(f"widths are {widths}")
         own = {n.removeprefix(_NETWORK): v for n, v in tensors.items() if n.startswith(_NETWORK)}
         try:
-            network.load_state_dict(own)
+            with torch.device("meta"):  # takes neither memory, whatever the settings say, nor chance
+                network = RefinedNetwork(count, widths)
+            network.load_state_dict(own, assign=True)
         except RuntimeError as error:
             raise ValueError("its network has other layers") from error
         network = network.to(descriptors.device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]

@@ -55,7 +55,8 @@ class RefinedFit:
     Attributes:
         step: How many steps were made.
         skipped: How many of them had no finite loss or gradient, and changed nothing.
-        checks: [(step, PSNR, loss)] of the frames that are not fitted; empty where none could be spared.
+        checks: [(step, PSNR, loss)] of the frames that are not fitted; empty where none could be spared, or
+            those show nothing.
     """
 
     def __init__(self, scene: Scene, solved: Portrait, config: RefinedConfig, seed: int) -> None:
@@ -87,7 +88,9 @@ class RefinedFit:
         self.network = network.to(scene.device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         count = len(solved.points)
         self.descriptors = torch.zeros(count, config.descriptors, device=scene.device, requires_grad=True)
-        self._exposures = torch.zeros(len(scene.views), 3, device=scene.device, requires_grad=True)
+        self._exposures = torch.zeros(
+            len(scene.views), 3, device=scene.device, requires_grad=config.exposures
+        )
         self._row = {view.index: row for row, view in enumerate(scene.views)}
         groups: list[dict[str, Any]] = [{"params": list(self.network.parameters()), "lr": config.rate}]
         if config.exposures:
@@ -127,7 +130,7 @@ class RefinedFit:
         return values
 
     def check(self) -> tuple[float, float] | None:
-        """PSNR and loss of the held-out frames, mean over them; None without any.
+        """PSNR and loss of the held-out frames, mean over them; None without any, or if it is not finite.
 
         The PSNR is of display values where the mask is full, as they are measured; the loss that of the fit.
         """
@@ -145,7 +148,7 @@ class RefinedFit:
                 error = difference[:, region].double().square().mean()
             if bool(region.any()):
                 ratios.append(-10.0 * math.log10(max(float(error), 1e-12)))
-        if not ratios:
+        if not ratios or not math.isfinite(sum(ratios) + sum(losses)):
             return None
         self.checks.append((self.step, sum(ratios) / len(ratios), sum(losses) / len(losses)))
         return self.checks[-1][1:]

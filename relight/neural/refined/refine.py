@@ -67,13 +67,13 @@ def refine_solved(
         fit.check()
 
     def portrait() -> Portrait:
-        return _portrait(fit, solved, best if fit.checked else fit.state(), watch)
+        return _portrait(fit, solved, best if fit.checks else fit.state(), watch)
 
     saved_s = time.perf_counter()
     while fit.step < config.steps and watch.left_s > 0 and not _settled(fit, config.patience):
         fit.advance()
         last = fit.step == config.steps
-        if fit.checked and (fit.step % config.check_every == 0 or last):
+        if fit.checks and (fit.step % config.check_every == 0 or last):
             best = _better(fit, best)
         if checkpoint is not None and time.perf_counter() - saved_s > _SAVE_EVERY_S:
             fit.save(checkpoint, best)
@@ -83,10 +83,11 @@ def refine_solved(
         if watch.limit_s is not None:
             done = max(done, watch.elapsed_s / max(watch.limit_s, 1e-9))
         progress("refine", min(1.0, done))
-    if fit.checked and fit.checks[-1][0] != fit.step and fit.step >= _FEWEST_STEPS:
-        best = _better(fit, best)
     if checkpoint is not None:
         fit.save(checkpoint, best)
+    # A look out of turn is not kept: a fit that goes on shall be as if it had never been stopped.
+    if fit.checks and fit.checks[-1][0] != fit.step and fit.step >= _FEWEST_STEPS:
+        best = _better(fit, best)
     progress("refine", 1.0)
     return portrait()
 
@@ -119,10 +120,18 @@ def _portrait(
     warnings = list(solved.info.get("warnings", ()))
     if fit.step < _FEWEST_STEPS:
         state = None
-        warnings.append("There was no time for the refinement: this is the photometric solve.")
+        warnings.append(
+            f"The refinement had no time for {_FEWEST_STEPS} steps, and fewer teach nothing: this is the "
+            "photometric solve."
+        )
     elif state is None:
         warnings.append(
             "The refinement made frames that it was not fitted to no better: this is the photometric solve."
+        )
+    elif not fit.checks:
+        warnings.append(
+            "There are too few lit frames to spare some, so nothing says whether the refinement shows new "
+            "views better than the photometric solve."
         )
     if fit.skipped:
         warnings.append(f"{fit.skipped} steps of the refinement had no finite loss and were skipped.")
