@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from analytic_scene import looking_at
 
 from capture.cameras import Camera
 from relight.environment import DiffuseIrradiance
+from relight.lamp import Lamp
 from relight.lighting import (
     CapturedLight,
     DirectionalLight,
@@ -56,6 +58,11 @@ def random_maps(*shape, dtype=DOUBLE, seed=0):
     return FlatMaps(
         **{name: value.to(dtype).reshape(*shape, *value.shape[1:]) for name, value in vars(maps).items()}
     )
+
+
+def with_fields(maps, **fields):
+    """The maps with fields that only some of them have."""
+    return SimpleNamespace(**vars(maps), **fields)
 
 
 def one_point(normal, point=(0.0, 0.0, 0.0), albedo=1.0, dtype=DOUBLE):
@@ -172,6 +179,45 @@ def test_flash_without_an_offset_sits_at_the_lens():
         shade(FlashLight(), maps, **capture(flash_offset_cam_m=None)),
         shade(FlashLight(), maps, **capture(flash_offset_cam_m=(0, 0, 0))),
     )
+
+
+def test_maps_that_know_a_gain_of_the_flash_have_it_in_the_flash_and_nowhere_else():
+    maps = random_maps(4, 6)
+    gain = 0.5 + torch.rand(4, 6, 3, generator=torch.Generator().manual_seed(5), dtype=DOUBLE)
+    gained = with_fields(maps, flash_gain=gain)
+    for settings in ({}, {"reflectance": Reflectance(0.5, 0.3, 0.04)}, {"lamp": Lamp(falloff=2.0)}):
+        flash, room = (shade(light, maps, **capture(**settings)) for light in (FlashLight(), RoomLight()))
+        torch.testing.assert_close(shade(FlashLight(), gained, **capture(**settings)), gain * flash)
+        torch.testing.assert_close(shade(CapturedLight(), gained, **capture(**settings)), room + gain * flash)
+    others = (DirectionalLight((0, 0, 1)), PointLight((0.3, 0.4, 0.5)), EnvironmentLight(panorama()))
+    for light in (RoomLight(), *others):
+        assert torch.equal(shade(light, gained, **capture()), shade(light, maps, **capture())), light
+
+
+def test_a_gain_of_one_or_none_changes_nothing_and_off_the_mask_it_is_not_looked_at():
+    maps = random_maps(4, 6)
+    plain = shade(CapturedLight(), maps, **capture())
+    ones = torch.ones(4, 6, 3, dtype=DOUBLE)
+    broken = torch.where((maps.mask > 0)[..., None], ones, torch.nan)
+    for gain in (None, ones, broken):
+        assert torch.equal(shade(CapturedLight(), with_fields(maps, flash_gain=gain), **capture()), plain)
+
+
+def test_a_flash_that_the_maps_know_themselves_takes_no_gain():
+    maps, own = random_maps(4, 6), torch.full((4, 6, 3), 0.25, dtype=DOUBLE)
+    known = with_fields(maps, flash_gain=2.0 * torch.ones(4, 6, 3, dtype=DOUBLE), flash_radiance=own)
+    expected = own * (maps.mask > 0)[..., None]
+    assert torch.equal(shade(FlashLight(), known, **capture()), expected)
+
+
+def test_the_gain_of_the_flash_has_a_gradient():
+    maps = random_maps(6)
+    gain = torch.full((6, 3), 1.2, dtype=DOUBLE, requires_grad=True)
+
+    def flash(gain):
+        return shade(FlashLight(), with_fields(maps, flash_gain=gain), **capture())
+
+    torch.autograd.gradcheck(flash, (gain,))
 
 
 def test_directional_light_is_the_papers_formula_whatever_the_length_of_its_direction():
