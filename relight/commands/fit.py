@@ -50,8 +50,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--preset",
         default="solve",
         metavar="NAME",
-        help="how: solve, the photometric solve without a network (default); paper, the paper's network, "
-        "which takes hours",
+        help="how: solve, the photometric solve without a network (default); fast and balanced, with a small "
+        "network for what the solve leaves; paper, the paper's network, which takes hours",
     )
     parser.add_argument("--name", metavar="NAME", help="what to call the portrait (default: its preset)")
     parser.add_argument(
