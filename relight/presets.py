@@ -6,6 +6,7 @@ of the lights. The module of a refinement is imported when it is asked for.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from importlib import import_module
@@ -49,13 +50,17 @@ class Preset:
         """The configuration with some settings other than usual; None where there is nothing to set.
 
         Raises:
-            PlanError: There is no such setting; the message lists those that there are.
+            PlanError: There is no such setting, and the message lists those that there are; or it is of
+                another kind than the usual one.
         """
         usual = None if self.make_config is None else _loaded(self.make_config)()
         known = [] if usual is None else [field.name for field in fields(usual)]
         if unknown := sorted(settings.keys() - set(known)):
             listed = f"it has {', '.join(sorted(known))}" if known else "it has none"
             raise PlanError(f"The preset has no setting {unknown[0]!r}; {listed}.")
+        for name, value in settings.items():
+            if not _is_like(value, own := getattr(usual, name)):
+                raise PlanError(f"The preset's setting {name!r} cannot be {value!r}; usual is {own!r}.")
         return usual if self.make_config is None else _loaded(self.make_config)(**settings)
 
 
@@ -79,6 +84,15 @@ def chosen_preset(name: str) -> Preset:
     if name in PRESETS:
         return PRESETS[name]
     raise PlanError(f"There is no preset {name!r}; known are {', '.join(PRESETS)}.")
+
+
+def _is_like(value: Any, usual: Any) -> bool:
+    """Whether a setting is of the kind of the usual one; lists, as JSON has them, are for tuples."""
+    if isinstance(usual, tuple):
+        return isinstance(value, list | tuple) and all(_is_like(each, usual[0]) for each in value)
+    if isinstance(usual, float):
+        return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    return type(value) is type(usual)
 
 
 def _loaded(place: str) -> Any:

@@ -52,6 +52,33 @@ def test_an_unknown_setting_is_refused_with_those_that_there_are():
         Preset().config({"steps": 1})
 
 
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("steps", "many"),
+        ("steps", 2.5),
+        ("steps", True),
+        ("patch", None),
+        ("rate", "high"),
+        ("rate", float("nan")),
+        ("rate", False),
+        ("exposures", "off"),
+        ("exposures", 1),
+        ("precision", 3),
+        ("widths", 16),
+        ("widths", [16, "wide"]),
+    ],
+)
+def test_a_setting_of_another_kind_is_refused_with_the_usual_one(name, value):
+    with pytest.raises(PlanError, match=f"{name}.*usual is"):
+        PRESETS["fast"].config({name: value})
+
+
+def test_settings_as_json_has_them_are_taken():
+    config = PRESETS["fast"].config({"widths": [16, 24], "rate": 1, "patch": 64})
+    assert (list(config.widths), config.rate, config.patch) == ([16, 24], 1, 64)
+
+
 def test_the_refined_portrait_is_saved_with_its_decoder_and_settings(session):
     folder = fit(session, "plain", device="cpu", max_seconds=1e6, settings={"factor": 0.5}, seed=7)
     portrait = load_portrait(folder)

@@ -38,6 +38,10 @@ class RefinedConfig:
     exposures: bool = True
 
     def __post_init__(self) -> None:
+        if min(self.widths, default=0) <= self.descriptors:
+            raise PlanError(
+                f"widths are {self.widths}; each is more than the {self.descriptors} descriptors."
+            )
         multiple = 1 << (len(self.widths) - 1)
         if self.patch < multiple or self.patch % multiple:
             raise PlanError(
@@ -47,6 +51,8 @@ class RefinedConfig:
             raise PlanError(f"precision is {self.precision!r}; it is one of {', '.join(PRECISIONS)}.")
         if self.steps < 1 or self.check_every < 1 or self.patience < 1 or self.descriptors < 0:
             raise PlanError("steps, check_every and patience are at least 1, and descriptors at least 0.")
+        if not (self.rate > 0 and self.descriptor_rate > 0):
+            raise PlanError("rate and descriptor_rate are above 0.")
 
 
 def fast_config(**settings: object) -> RefinedConfig:

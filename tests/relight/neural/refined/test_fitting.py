@@ -310,6 +310,12 @@ def test_flash_frames_have_the_gains_that_the_solve_found(scene, config, solved)
         {"check_every": 0},
         {"patience": 0},
         {"descriptors": -1},
+        {"rate": 0.0},
+        {"descriptor_rate": -1.0},
+        {"rate": float("nan")},
+        {"widths": (16, 2, 32, 48)},
+        {"widths": (0, 24, 32, 48)},
+        {"widths": ()},
     ],
 )
 def test_impossible_settings_are_refused(settings):
