@@ -64,7 +64,6 @@ class RefinedDecoder(Decoder):
         layers = changed(layers_of(maps), changes)
         return replace(
             maps,
-            albedo=layers.albedo,
             room_radiance=layers.room_radiance,
             mask=layers.mask,
             flash_gain=layers.flash_gain,

@@ -15,11 +15,10 @@ STACKED = 13
 FEATURES = 18
 """Channels that the network sees of the maps."""
 
-CHANGES = 10
-"""Channels that it gives: albedo 3, room radiance 3, flash 3, mask 1."""
+CHANGES = 7
+"""Channels that it gives: room radiance 3, flash 3, mask 1."""
 
 _MOST = 0.7  # of a change, in logarithms
-_DETAIL_PX = 7  # changes of the albedo have no mean over so many pixels
 _MASK_GAIN = 4.0  # of a logit: what is learned of the mask is learned at the rate of all else
 _LOWEST, _HIGHEST = 1e-3, 0.999  # of a mask whose logit is finite
 
@@ -121,28 +120,18 @@ def changed(layers: Layers, changes: torch.Tensor) -> Layers:
     """Layers after what the network gives [CHANGES, H, W]; as they are where it gives 0.
 
     One frame cannot tell what its light model lacks from an albedo or a normal that is off, and would bend
-    both. So normals stay as the surface has them, the albedo gains detail but no mean over a neighbourhood,
-    and what the model of the flash lacks goes into a gain of the flash alone.
+    both. So these stay as all frames together have them, and what the model of the flash lacks goes into a
+    gain of the flash alone.
     """
     on = layers.mask > 0
-    bounded = _MOST * torch.tanh(changes[:9])
-    by_albedo = (bounded[:3] - _local_mean(bounded[:3], on)).permute(1, 2, 0)
-    by_room, by_flash = bounded[3:].permute(1, 2, 0).split(3, dim=-1)
-    logit = torch.logit(layers.mask.clamp(_LOWEST, _HIGHEST)) + _MASK_GAIN * changes[9]
+    by_room, by_flash = (_MOST * torch.tanh(changes[:6])).permute(1, 2, 0).split(3, dim=-1)
+    logit = torch.logit(layers.mask.clamp(_LOWEST, _HIGHEST)) + _MASK_GAIN * changes[6]
     return replace(
         layers,
-        albedo=layers.albedo * by_albedo.exp(),
         room_radiance=layers.room_radiance * by_room.exp(),
         mask=torch.where(on, torch.sigmoid(logit), 0.0),
         flash_gain=by_flash.exp(),
     )
-
-
-def _local_mean(image: torch.Tensor, on: torch.Tensor) -> torch.Tensor:
-    """Means [C, H, W] over a neighbourhood of what of it is on the subject [H, W]."""
-    weighted = torch.cat([image * on, on[None].to(image)])[None]
-    sums = torch.nn.functional.avg_pool2d(weighted, _DETAIL_PX, 1, _DETAIL_PX // 2)[0]
-    return sums[:-1] / sums[-1:].clamp(min=1e-6)
 
 
 def strided(ids: torch.Tensor, scales: int) -> list[torch.Tensor]:
