@@ -13,6 +13,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, fields
+from itertools import pairwise
+from statistics import median
 from typing import Any
 
 from capture.frame_record import FrameRecord
@@ -29,8 +31,10 @@ MATTERING: Mapping[str, tuple[str, ...]] = {
     "colour": ("camera", "white_balance_k"),
     "room_white": ("camera", "white_balance_k"),
     "flash_strength": ("camera", "exposure_s", "gain", "white_balance_k"),
+    "readout_s": ("camera", "width", "height", "rate_hz"),
 }
 
+_LONGEST_STEP_S = 1 / 12  # frames of a film; less often they are stills
 _TOLERANCE = 0.02  # relative: what a read-back rounds, and less than one sees
 _WORDS = {
     "camera": "the camera is {1}, not {0}",
@@ -40,6 +44,7 @@ _WORDS = {
     "gain": "the gain is {1:.3g}, not {0:.3g}",
     "white_balance_k": "the white balance is {1:.0f} K, not {0:.0f} K",
     "focus": "the focus is {1:g}, not {0:g}",
+    "rate_hz": "the camera takes {1:.4g} frames a second, not {0:.4g}",
 }
 
 
@@ -55,6 +60,7 @@ class Controls:
         gain: in the device's own units, or sensitivity over ISO 100.
         white_balance_k: colour temperature, kelvin.
         focus: in the device's own units.
+        rate_hz: frames a second of a film.
     """
 
     camera: str | None = None
@@ -64,6 +70,7 @@ class Controls:
     gain: float | None = None
     white_balance_k: float | None = None
     focus: float | None = None
+    rate_hz: float | None = None
 
     def differences(self, live: Controls, names: Iterable[str]) -> list[str]:
         """Clauses on those of the named settings that are known on both sides and are not the same."""
@@ -124,7 +131,8 @@ def controls_of_session(info: Mapping[str, Any], frames: Iterable[FrameRecord]) 
     device = info.get("device") or {}
     image = info["image"]
     told = _told(device)
-    kept = [record for record in frames if record.file is not None]
+    records = list(frames)
+    kept = [record for record in records if record.file is not None]
     by_frame = common_controls(Controls(exposure_s=record.exposure_s, gain=record.gain) for record in kept)
     exposure_s = told.get("exposure_s") if by_frame.exposure_s is None else by_frame.exposure_s
     return Controls(
@@ -135,6 +143,7 @@ def controls_of_session(info: Mapping[str, Any], frames: Iterable[FrameRecord]) 
         gain=told.get("gain") if by_frame.gain is None else by_frame.gain,
         white_balance_k=told.get("white_balance_k"),
         focus=told.get("focus"),
+        rate_hz=_rate_of(device, records),
     )
 
 
@@ -156,6 +165,20 @@ def _told(device: Mapping[str, Any]) -> dict[str, float]:
         for name, value in told.items()
         if isinstance(value, int | float) and not isinstance(value, bool)
     }
+
+
+def _rate_of(device: Mapping[str, Any], records: list[FrameRecord]) -> float | None:
+    """Frames a second: by the times of neighbouring frames, else what the camera's stream promises."""
+    steps_s = [
+        after.pts_s - before.pts_s
+        for before, after in pairwise(records)
+        if before.pts_s is not None and after.pts_s is not None and after.index == before.index + 1
+    ]
+    if steps_s and 0 < (usual_s := median(steps_s)) <= _LONGEST_STEP_S:
+        return 1.0 / usual_s
+    stream = device.get("stream")
+    promised = stream.get("fps") if isinstance(stream, Mapping) else None
+    return float(promised) if isinstance(promised, int | float) and promised > 0 else None
 
 
 def _number(text: Any) -> float | None:

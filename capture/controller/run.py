@@ -24,6 +24,7 @@ from capture.controller.report import Counts, capture_report, pulse_warning
 from capture.controller.stop_rules import SILENCE_S, StopRules
 from capture.controller.tags import apply_tags
 from capture.controller.time_axis import TimeAxis
+from capture.controls import Controls
 from capture.devices.bench import Bench
 from capture.devices.camera import CameraDevice, CapturedFrame, LockReport
 from capture.devices.flash import FlashDevice, FlashEdge, PulseTrain
@@ -37,6 +38,7 @@ from capture.errors import (
 )
 from capture.session import FrameRecord, Session
 from capture.tagging import FrameTag, TaggingConfig
+from capture.tagging.given_readout import with_given_readout
 from capture.tagging.stream_summary import StreamResult
 
 _READ_TIMEOUT_S = 0.5
@@ -150,6 +152,13 @@ class _Capture:
             risk=_RISK,
             stamp_sigma_s=_STAMP_SIGMA_S,
         )
+        live = Controls(
+            camera=camera.info.name,
+            width=camera.format.width,
+            height=camera.format.height,
+            rate_hz=camera.format.fps,
+        )
+        tagging = with_given_readout(tagging, config.calibration, live)
         self._looker = FrameLooker(camera.format, tagging, flash.info.name)
         self._tagger = ThreadPoolExecutor(1, thread_name_prefix="tags")
         self._tagging: Future[dict[int, FrameTag]] | None = None

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from capture.cameras import PosedFrame
+from capture.controls import Controls
 from capture.errors import TaggingError
 from capture.frame_record import FrameRecord
 from capture.importers.flash_list import read_flash_list
@@ -15,7 +16,8 @@ from capture.importers.options import ImportOptions
 from capture.importers.recording_parts import Recording
 from capture.importers.sidecar_evidence import Evidence, FrameTimes
 from capture.importers.video_survey import Survey
-from capture.tagging import FlashPrior, TagResult, tag
+from capture.tagging import FlashPrior, TaggingConfig, TagResult, tag
+from capture.tagging.given_readout import with_given_readout
 from capture.tagging.records import with_tag
 
 _GAP = 1.6  # of the usual frame interval, from which frames are missing before a frame
@@ -73,7 +75,10 @@ def tag_records(
             replace(record, flash=flag, reasons=(*record.reasons, *(("untagged",) if flag is None else ())))
             for record, flag in listed
         ], None
-    result = _tag_with_prior(survey, times.prior, warnings)
+    first = records[0]
+    live = Controls(width=first.width, height=first.height, rate_hz=1.0 / survey.profiles.interval_s)
+    config = with_given_readout(TaggingConfig(), options.calibration, live)
+    result = _tag_with_prior(survey, times.prior, config, warnings)
     warnings += result.warnings
     tagged = list(records)
     sound = [record.index for record in records if "unreadable" not in record.reasons]
@@ -82,13 +87,15 @@ def tag_records(
     return tagged, result
 
 
-def _tag_with_prior(survey: Survey, prior: FlashPrior | None, warnings: list[str]) -> TagResult:
+def _tag_with_prior(
+    survey: Survey, prior: FlashPrior | None, config: TaggingConfig, warnings: list[str]
+) -> TagResult:
     """Tags with a sidecar's prior; one that contradicts the pictures is left out, and a warning says so."""
     if prior is None:
-        return tag(survey.profiles)
+        return tag(survey.profiles, config=config)
     try:
-        return tag(survey.profiles, schedule=prior)
+        return tag(survey.profiles, schedule=prior, config=config)
     except TaggingError as contradiction:
-        result = tag(survey.profiles)
+        result = tag(survey.profiles, config=config)
         warnings.append(f"The sidecar was left out: {contradiction}")
         return result

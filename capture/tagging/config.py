@@ -13,6 +13,7 @@ class TaggingConfig:
         exposure_s: the exposure time when it is known; fitted otherwise.
         readout_s: time from the first row's start to the last row's, negative when the bottom row is first;
             fitted otherwise.
+        readout_sigma_s: standard deviation of the readout that is known; labels hold in spite of it.
         shortest_period_s: of the flash.
         longest_period_s: of the flash.
         longest_on_s: the longest pulse looked for; the frames between pulses must be the larger part.
@@ -33,6 +34,7 @@ class TaggingConfig:
 
     exposure_s: float | None = None
     readout_s: float | None = None
+    readout_sigma_s: float = 0.0
     shortest_period_s: float = 0.5
     longest_period_s: float = 2.0
     longest_on_s: float = 0.35
@@ -59,6 +61,10 @@ class TaggingConfig:
         if not 0 <= self.none_lit < self.full_lit <= 1:
             raise ValueError(
                 f"none_lit {self.none_lit} and full_lit {self.full_lit} must satisfy 0 <= none < full <= 1"
+            )
+        if not 0 <= self.readout_sigma_s < 1:
+            raise ValueError(
+                f"readout_sigma_s is {self.readout_sigma_s}; it must not be negative, and below 1 s"
             )
         if self.exposure_s is not None and not 0 < self.exposure_s < 1:
             raise ValueError(f"exposure_s is {self.exposure_s}; it must be positive and below 1 s")

@@ -134,7 +134,7 @@ class KnownFlash:
         return replace(
             fit,
             stretch_sigma=stretch,
-            readout_doubt_s=readout,
+            readout_doubt_s=readout if config.readout_s is None else config.readout_sigma_s,
             readout_sigma_s=max(fit.readout_sigma_s, readout, stretch * abs(fit.readout_s) if free else 0.0),
             exposure_sigma_s=max(fit.exposure_sigma_s, stretch * fit.exposure_s if free else 0.0),
         )

@@ -104,7 +104,7 @@ def fit_shutter(
             known; None = none is.
     """
     if config.readout_s is not None and config.exposure_s is not None:
-        return Shutter(config.readout_s, config.exposure_s, 0.0, 0.0, 0.0)
+        return Shutter(config.readout_s, config.exposure_s, 0.0, 0.0, 0.0, config.readout_sigma_s)
     data, gain_prior = data.merged(_MERGE), gain_prior.reshape(-1, _MERGE).mean(axis=1)
     most = _thin(len(data.start_s), _MOST)
     asked_s = np.full(len(cycle), np.nan) if commanded_s is None else commanded_s
@@ -133,6 +133,7 @@ def fit_shutter(
         if config.exposure_s is not None
         else float(np.hypot(stretch * exposure_s, roll * span)),
         stretch_sigma=0.0 if config.readout_s is not None or config.exposure_s is not None else stretch,
+        readout_doubt_s=0.0 if config.readout_s is None else config.readout_sigma_s,
     )
 
 

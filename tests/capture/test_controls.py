@@ -15,6 +15,7 @@ SET = Controls(
     gain=64.0,
     white_balance_k=4600.0,
     focus=30.0,
+    rate_hz=30.0,
 )
 EVERY = tuple(vars(SET))
 
