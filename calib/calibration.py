@@ -22,6 +22,8 @@ units:
                          2018); 0 = the same in every direction
     flash_strength       [3] C_flash: radiance of a white Lambertian surface that faces the flash at 1 m, m^2,
                          in camera RGB
+    readout_s            of a rolling shutter, for tagging: from the first row's start to the last row's, s,
+                         negative when the bottom row is first
 
 An entry may say which settings of the camera it holds for ("made_with"); `session_calibration` leaves out
 those that do not hold for a session.
@@ -92,6 +94,7 @@ _KINDS = {
         "1", (), 0.0, (0.0,), "No flash falloff is known; the flash is taken as equal in all directions."
     ),
     "flash_strength": _Kind("m^2", (3,), 0.0, None, "No flash strength is known; the fit finds it."),
+    "readout_s": _Kind("s", (), None, None, "No readout is known; each tagging of the flash finds it."),
 }
 _NO_INTRINSICS = "No intrinsics are known; those of the poses are used."
 _NO_RESPONSE = "No response is known; the transfer function of the frames is used."
@@ -136,6 +139,7 @@ class Calibration:
     flash_axis: Quantity | None = None
     flash_falloff: Quantity | None = None
     flash_strength: Quantity | None = None
+    readout_s: Quantity | None = None
 
     def value(self, name: str) -> NDArray[np.float64] | None:
         """The value of a quantity by its name, or its fallback; None where only the fit can tell."""

@@ -8,6 +8,7 @@ CalibrationError
 ├── NoiseError       pictures do not tell dark level or noise
 ├── FlatFieldError   pictures of an even surface do not tell how the lens falls off
 ├── ColourError      pictures of a chart do not tell colours
+├── ReadoutError     a blinking flash does not tell the readout of a rolling shutter
 ├── ReportError      a calibration cannot be shown
 └── FlashGeometryError  pictures of a board do not tell where the flash is and how it shines
 
@@ -48,6 +49,10 @@ class FlashGeometryError(CalibrationError):
 
 class ColourError(CalibrationError):
     """Pictures of a colour chart do not tell how camera RGB becomes colours."""
+
+
+class ReadoutError(CalibrationError):
+    """Frames with a blinking flash do not tell the readout of a rolling shutter."""
 
 
 class ReportError(CalibrationError):

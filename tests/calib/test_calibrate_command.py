@@ -139,6 +139,6 @@ def test_a_wrong_command_line_is_a_usage_error(arguments):
 
 
 def test_each_part_has_help(capsys):
-    for part in ("board", "intrinsics", "flash", "response", "dark", "flat", "convert"):
+    for part in ("board", "intrinsics", "flash", "response", "dark", "flat", "readout", "convert"):
         assert main(["calibrate", part, "--help"]) == 0
         assert "--debug" in capsys.readouterr().out

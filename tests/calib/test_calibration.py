@@ -30,6 +30,7 @@ def everything():
         flash_axis=Quantity.of([0.0, 0.6, 0.8], "1", "wall"),
         flash_falloff=Quantity.of(1.5, "1", "wall"),
         flash_strength=Quantity.of([0.16, 0.157, 0.15], "m^2", "grey card"),
+        readout_s=Quantity.of(-0.0201, "s", "30 flashes", 1e-4),
     )
 
 
@@ -66,7 +67,7 @@ def test_nothing_known_is_a_calibration_that_says_what_it_assumes(tmp_path):
     assert np.array_equal(found.value("colour"), np.eye(3))
     assert found.value("flash_strength") is None
     sentences = found.assumptions()
-    assert len(sentences) == len(set(sentences)) == 11
+    assert len(sentences) == len(set(sentences)) == 12
     assert any("at the lens" in sentence for sentence in sentences)
 
 

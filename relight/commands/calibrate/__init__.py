@@ -23,6 +23,10 @@ _PARTS = {
         "camera RGB to true colours under flash and room, from a ColorChecker",
     ),
     "flash": ("relight.commands.calibrate.flash", "where the flash is and how it shines, from a lit board"),
+    "readout": (
+        "relight.commands.calibrate.readout",
+        "how long a rolling shutter takes over its rows, from a blinking flash",
+    ),
     "report": ("relight.commands.calibrate.report", "a page to judge a calibration by, in one file"),
     "convert": (
         "relight.commands.calibrate.convert",
