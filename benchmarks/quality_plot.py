@@ -11,14 +11,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from capture.images import write_png
-
 Curve = Sequence[tuple[float, float]]
 """[(seconds, value)], ascending."""
 
 _WIDTH, _HEIGHT = 400, 260  # of a panel, pixels
 _LEFT, _RIGHT, _TOP, _BOTTOM = 52, 14, 34, 34
-_COLOURS = ((90, 90, 90), (200, 60, 30), (30, 90, 200), (20, 140, 70))
+_COLOURS = ((90, 90, 90), (30, 90, 200), (200, 60, 30), (20, 140, 70), (150, 60, 170))
 _INK, _GRID = (40, 40, 40), (225, 225, 225)
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 _TICKS_S = (10, 30, 60, 120, 300, 600, 1500, 3600)
@@ -38,22 +36,21 @@ class Panel:
 
 
 def draw(panels: Sequence[Panel], path: Path, columns: int = 3) -> None:
-    """Writes the panels as a PNG, the names of the curves in the first."""
+    """Writes the panels as a PNG, the names of the curves below."""
     times = [time_s for panel in panels for curve in panel.curves.values() for time_s, _ in curve]
     if not times:
         return
     span_s = (min(5.0, *times), 1.15 * max(times))
     names = list(dict.fromkeys(name for panel in panels for name in panel.curves))
-    drawn = [_panel(panel, span_s, names, legend=number == 0) for number, panel in enumerate(panels)]
+    drawn = [_panel(panel, span_s, names) for panel in panels]
     drawn += [np.full_like(drawn[0], 255)] * (-len(drawn) % columns)
     rows = [np.hstack(drawn[first : first + columns]) for first in range(0, len(drawn), columns)]
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_png(path, np.vstack(rows))
+    picture = np.vstack([*rows, _legend(names, columns * _WIDTH)])
+    cv2.imwrite(str(path), picture[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 9])
 
 
-def _panel(
-    panel: Panel, span_s: tuple[float, float], names: Sequence[str], *, legend: bool
-) -> NDArray[np.uint8]:
+def _panel(panel: Panel, span_s: tuple[float, float], names: Sequence[str]) -> NDArray[np.uint8]:
     picture = np.full((_HEIGHT, _WIDTH, 3), 255, np.uint8)
     values = [value for curve in panel.curves.values() for _, value in curve]
     low, high = (min(values), max(values)) if values else (0.0, 1.0)
@@ -83,10 +80,15 @@ def _panel(
         for point in curve:
             cv2.circle(picture, place(*point), 4, colour, -1, cv2.LINE_AA)
     _write(picture, panel.title, (_LEFT, 20), 0.45)
-    for row, name in enumerate(names if legend else ()):
-        x, y = _WIDTH - 100, _HEIGHT - _BOTTOM - 14 - 17 * row
-        cv2.circle(picture, (x, y - 4), 4, _COLOURS[row % len(_COLOURS)], -1, cv2.LINE_AA)
-        _write(picture, name, (x + 10, y))
+    return picture
+
+
+def _legend(names: Sequence[str], width: int) -> NDArray[np.uint8]:
+    picture = np.full((30, width, 3), 255, np.uint8)
+    for number, name in enumerate(names):
+        x = _LEFT + 160 * number
+        cv2.circle(picture, (x, 12), 4, _COLOURS[number % len(_COLOURS)], -1, cv2.LINE_AA)
+        _write(picture, name, (x + 10, 16))
     return picture
 
 
