@@ -14,6 +14,7 @@ from capture.calibration_file import Quantity, write_calibration_entries
 from capture.controls import Controls, controls_of_session
 from capture.errors import CalibrationError
 from capture.frame_record import FrameRecord
+from capture.session import Session
 from capture.tagging import ProfileAccumulator, TaggingConfig
 from capture.tagging.given_readout import with_given_readout
 from capture.tagging.readout import measure_readout
@@ -132,6 +133,53 @@ def test_a_film_becomes_an_entry_that_an_import_is_given(film, tmp_path, capsys)
     found = load_calibration(again).readout_s
     assert abs(found.value - 0.02) < WITHIN * found.sigma
     assert found.made_with.rate_hz == pytest.approx(30.0, rel=1e-3)
+
+
+LIGHT = {
+    "readout_s": -0.0151,
+    "readout_sigma_s": 2e-4,
+    "exposure_s": 0.005,
+    "period_s": 1.013,
+    "pulses": 40,
+}
+
+
+def captured(path, light):
+    """A session as a capture leaves it, of a camera that promises 30 frames a second."""
+    device = {"camera": {"name": "C920"}, "stream": {"fps": 30.0}}
+    with Session.create(
+        path, source={"kind": "capture"}, width=64, height=48, transfer="srgb", device=device
+    ) as session:
+        session.update_info(capture={"light": light})
+        session.finish()
+    return str(path)
+
+
+def test_what_a_capture_recorded_is_taken_with_a_wider_uncertainty(tmp_path, capsys):
+    out = tmp_path / "calibration.json"
+    assert main(["calibrate", "readout", captured(tmp_path / "S", LIGHT), "--out", str(out)]) == 0
+    assert "the bottom row first, from 40 flashes" in capsys.readouterr().out
+    entry = load_calibration(out).readout_s
+    assert entry.value == -0.0151
+    assert entry.sigma == pytest.approx(np.hypot(2e-4, 0.015 * 0.0201))
+    assert entry.made_with == Controls(camera="C920", width=64, height=48, rate_hz=30.0)
+
+
+@pytest.mark.parametrize(
+    ("light", "words"),
+    [
+        (None, "no readout that was measured in it"),
+        (LIGHT | {"readout_s": None, "readout_sigma_s": None}, "no readout that was measured in it"),
+        (LIGHT | {"period_s": 1.0}, "in step with the camera"),
+        (LIGHT | {"period_s": None}, "in step with the camera"),
+        (LIGHT | {"pulses": 4}, "4 flashes are too few"),
+    ],
+)
+def test_a_capture_that_does_not_tell_is_refused(tmp_path, capsys, light, words):
+    out = tmp_path / "calibration.json"
+    assert main(["calibrate", "readout", captured(tmp_path / "S", light), "--out", str(out)]) == 1
+    assert words in capsys.readouterr().err
+    assert not out.exists()
 
 
 def test_a_readout_is_given_where_size_and_rate_are_its_own(tmp_path):
