@@ -28,18 +28,22 @@ class GatedConv(nn.Module):
     """
 
     def __init__(self, channels_in: int, channels_out: int, *, normalised: bool) -> None:
-        """Random weights; `normalised` adds a batch normalisation, as in neural point-based graphics."""
+        """Random weights; `normalised` adds a normalisation over the features of each pixel (Ba et al. 2016).
+
+        In neural point-based graphics it is over a batch, but the statistics of a batch of one patch are not
+        those of the next, nor of a whole view.
+        """
         super().__init__()
         self.channels_out = channels_out
         # Features and gates in one convolution: half the passes over the input.
         self.conv = nn.Conv2d(channels_in, 2 * channels_out, 3, padding=1, padding_mode="zeros")
-        self.norm = nn.BatchNorm2d(channels_out) if normalised else None
+        self.norm = nn.LayerNorm(channels_out) if normalised else None
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """[B, channels_in, H, W] to [B, channels_out, H, W]."""
         features, gate = self.conv(x).split(self.channels_out, dim=1)
         gated = leaky_relu(features, _LEAK) * torch.sigmoid(gate)
-        return gated if self.norm is None else self.norm(gated)
+        return gated if self.norm is None else self.norm(gated.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
 
 
 class GatedUNet(nn.Module):
@@ -63,7 +67,7 @@ class GatedUNet(nn.Module):
             channels_in: Of each raw image, finest first; T + 1 of them.
             channels_out: Of the image that comes out, without a non-linearity.
             widths: Of the features at each scale, as many as raw images and each wider than its raw image.
-            normalised: Whether gated convolutions are batch normalised.
+            normalised: Whether gated convolutions are normalised.
 
         Raises:
             ValueError: `widths` are not as said.

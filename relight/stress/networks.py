@@ -60,7 +60,7 @@ def cases() -> Iterator[Case]:
     for stressed, (ids, gain) in _VIEWS.items():
         bound = _LAYERS if gain <= 1.0 else _SWITCHED
         yield Case(NETWORK, f"rendering: {stressed}", partial(_rendered, ids, gain, False), bound)
-        # A batch normalisation divides by a spread that may be of rounding alone: no bound.
+        # A normalisation divides by a spread that may be of rounding alone: no bound.
         yield Case(NETWORK, f"a step of training: {stressed}", partial(_rendered, ids, gain, True))
     for name, operator in _OPERATORS.items():
         yield checked(name, operator)

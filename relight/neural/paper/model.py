@@ -79,13 +79,13 @@ class PaperModel(nn.Module):
 
 def rendering_network(generator: torch.Generator | None = None) -> GatedUNet:
     """The paper's network; its weights come from the generator, or are anything where they will be loaded."""
-    network = GatedUNet([DESCRIPTOR_LENGTH] * LEVELS, CHANNELS, WIDTHS, normalised=False)
+    network = GatedUNet([DESCRIPTOR_LENGTH] * LEVELS, CHANNELS, WIDTHS)
     if generator is not None:
         for name, parameter in network.named_parameters():
             if parameter.ndim == 4:
                 gain = _FLAT if name.startswith("last") else _GAIN if ".conv." in name else 1.0
                 nn.init.normal_(parameter, std=gain * parameter[0].numel() ** -0.5, generator=generator)
-            else:
+            elif not name.endswith("norm.weight"):  # that is 1
                 nn.init.zeros_(parameter)
     return network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 

@@ -25,6 +25,7 @@ from relight.stages import Progress, no_progress
 log = logging.getLogger(__name__)
 
 _SAVE_EVERY_S = 60.0
+_LOST_DB = 3.0  # that held-out frames may fall from their best: patches make them waver by less
 _WITHOUT_VGG = (
     "VGG-16's weights were not given (--vgg FILE): pictures are compared by bands of a Laplacian pyramid "
     "instead, which is not the paper's measure."
@@ -137,6 +138,7 @@ def _portrait(fit: PaperFit, solved: Portrait, watch: Stopwatch, said: list[str]
     facts: dict[str, Any] = {
         "steps": fit.step,
         "skipped_steps": fit.skipped,
+        "shortened_gradients": fit.shortened,
         "seconds": round(watch.elapsed_s, 1),
         "perceptual": "VGG-16" if fit.config.vgg else "weight-free",
         "held_out_frames": [view.index for view in fit.checked],
@@ -146,6 +148,12 @@ def _portrait(fit: PaperFit, solved: Portrait, watch: Stopwatch, said: list[str]
     if fit.step < fit.config.steps:
         warnings.append(
             f"The paper's fit was ended by its time, after {fit.step} of {fit.config.steps} steps."
+        )
+    best_step, best_db = max(fit.held_out_db, key=lambda look: look[1], default=(0, 0.0))
+    if fit.held_out_db and fit.held_out_db[-1][1] < best_db - _LOST_DB:
+        warnings.append(
+            f"The paper's fit lost what it had: frames that it was not fitted to had {best_db:.1f} dB after "
+            f"{best_step} steps and have {fit.held_out_db[-1][1]:.1f} dB now; fit with a lower rate."
         )
     if fit.skipped:
         warnings.append(f"{fit.skipped} steps of the paper's fit had no finite loss and were skipped.")

@@ -26,13 +26,13 @@ class RefinedConfig:
         exposures: Whether each frame has a small exposure and white-balance residual of its own.
     """
 
-    steps: int = 400
+    steps: int = 200
     patch: int = 256
     rate: float = 2e-3
     descriptor_rate: float = 1e-2
     descriptors: int = 4
     widths: tuple[int, ...] = (16, 24, 32, 48)
-    check_every: int = 100
+    check_every: int = 50
     patience: int = 3
     precision: str = "float32"
     exposures: bool = True

@@ -50,6 +50,37 @@ def test_the_loss_falls_and_held_out_frames_are_seen_better(scene, solved, confi
     assert fit.skipped == 0
 
 
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_hasty_fit_is_not_lost(scene, solved, config, seed):
+    """Without a normalisation these two seeds end at 9 and 8 dB: gates that have closed do not open again."""
+    fit = PaperFit(scene, solved, replace(config, rate=3e-3), laplacian_perceptual, None, seed)
+    for _ in range(137):
+        fit.advance()
+    assert fit.look_at_held_out() > 20.0
+
+
+def test_a_gradient_far_longer_than_usual_is_shortened(scene, solved, config):
+    """A loss that is far too large for one step changes what is learned by no more than any other step."""
+    factor = [1.0]
+
+    def perceptual(picture, reference):
+        return factor[0] * laplacian_perceptual(picture, reference)
+
+    fit = PaperFit(scene, solved, config, perceptual, None, 0)
+
+    def length_of_a_step():
+        fit.advance()
+        gradients = (p.grad.double() for p in fit.model.parameters() if p.grad is not None)
+        return sum(float(gradient.square().sum()) for gradient in gradients) ** 0.5
+
+    usual = max(length_of_a_step() for _ in range(5))
+    assert fit.shortened == 0
+    factor[0] = 1e8
+    # Ten times a mean of those before; uncut it would be longer by far more.
+    assert length_of_a_step() <= 10.0 * usual * 1.001
+    assert fit.shortened == 1
+
+
 def test_held_out_frames_are_not_drawn(scene, solved, config):
     fit = begun(scene, solved, config)
     assert len(fit.checked) == 2
@@ -119,13 +150,12 @@ def test_a_step_without_a_finite_loss_is_skipped_and_many_end_the_fit(scene, sol
         return loss * torch.nan if broken[0] else loss
 
     fit = PaperFit(scene, solved, config, perceptual, None, 0)
-    before = {name: values for name, values in state_of(fit).items() if "running" not in name}
+    before = state_of(fit)
     fit.advance()
     assert (fit.step, fit.skipped) == (1, 1)
     after = state_of(fit)
     for name, values in before.items():
-        if "num_batches" not in name:
-            np.testing.assert_array_equal(after[name], values, err_msg=name)
+        np.testing.assert_array_equal(after[name], values, err_msg=name)
     broken[0] = False
     fit.advance()
     assert fit.skipped == 1
