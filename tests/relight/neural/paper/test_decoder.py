@@ -69,8 +69,8 @@ def test_a_view_is_the_same_whatever_part_of_the_picture_the_points_take(portrai
     intrinsics = CAMERA.K.copy()
     intrinsics[:2, 2] += 48
     wide = replace(CAMERA, width=128, height=128, K=intrinsics)
-    # Network and rasteriser do not know where in the picture they are, but for halvings; beyond the points, where
-    # features are nearly zero, a normalisation makes much of what little the box's edge changes.
+    # Network and rasteriser do not know where in the picture they are, but for halvings; beyond the points,
+    # where features are nearly zero, a normalisation makes much of what little the box's edge changes.
     near, far = (portrait.decoder.neural_maps(portrait.points, camera) for camera in (CAMERA, wide))
     inside = np.s_[:, 8:72, 8:72]
     np.testing.assert_allclose(
