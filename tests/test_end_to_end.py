@@ -90,6 +90,7 @@ def test_views_and_lights_become_the_files_that_other_tools_read(film, session, 
     lights = [light["name"] for light in json.loads((film / "lights.json").read_text())["lights"]]
     names = [frame.camera.name for frame in load_posed_set(film / "cameras_val.json").frames]
     maps = ["albedo", "normal", "shading", "mask", "depth"]
+    maps += ["albedo_sigma", "normal_sigma", "unobserved_flash", "unobserved_view"]
     expected = {f"{name}.{layer}.exr" for name in names for layer in maps + lights}
     expected |= {f"{name}.{light}.png" for name in names for light in lights}
     assert {path.name for path in out.iterdir()} == expected
