@@ -12,24 +12,20 @@ is what arrives, over pi (Goral et al. 1984, "Modeling the interaction of light 
 with the sum over directions in place of form factors). It does not depend on the light, so it is found once;
 a light then costs its direct part at the surfels and a few sparse products.
 
-Surfaces are taken for diffuse here, and the albedo for absolute: where its scale is a convention
-(`relight.photometric`) the light within the subject errs by as much.
-
-The flash of the capture bounced as well, and a fit that knows nothing of it takes hollows for brighter than
-they are. By how much follows from the same operator; before new light may bounce it is taken out of the
-albedo (`Interreflection.excess`), or it would count twice.
+Surfaces are taken for diffuse here, and the albedo for absolute. Where its scale is a convention
+(`relight.photometric`) a factor on it comes with the portrait, found from what bounced under the capture's
+own flash (`relight.flash_bounces`).
 """
 
 from __future__ import annotations
 
 import math
+from typing import Protocol
 
 import numpy as np
 import torch
 from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
-
-from relight.portrait import Portrait
 
 _SURFELS = 60_000
 _GOLDEN_RAD = math.pi * (3.0 - math.sqrt(5.0))
@@ -37,33 +33,56 @@ _DIRECTIONS = 128  # in pairs: one order serves both ways
 _CELL = 1.5  # across a bundle, in sides of a surfel
 _FACING = 0.05  # cosine under which a surfel takes no part in a bundle
 _BOUNCES = 3  # with an albedo of one half and half of the sky hidden, a fiftieth is left
-_LEAST_LIT = 1e-2  # a surfel that no light reaches has no albedo to correct
 _NEIGHBOURS = 6  # surfels that a point takes its indirect light from
 
 
+class Reflecting(Protocol):
+    """A surface that reflects; a portrait is one."""
+
+    @property
+    def points(self) -> torch.Tensor:
+        """[P, 3], world."""
+
+    @property
+    def normals_world(self) -> torch.Tensor:
+        """[P, 3], unit."""
+
+    @property
+    def albedo(self) -> torch.Tensor:
+        """[P, 3]."""
+
+    @property
+    def spacing(self) -> float:
+        """Of the points, world units."""
+
+
 class Interreflection:
-    """What the surfels of one portrait see of each other.
+    """What the surfels of one surface see of each other.
 
     Attributes:
-        ids: [S] int64, the point of the portrait that stands for each surfel.
+        ids: [S] int64, the point that stands for each surfel.
         normals_world: [S, 3], unit, mean of the surfel's points.
-        albedo: [S, 3], mean of the surfel's points, after `take_out_of_albedo` without its excess.
-        excess: [S, 3], by which share the fitted albedo is too high for light that bounced under the flash; 0
-            until `take_out_of_albedo`.
+        albedo: [S, 3], mean of the surfel's points, times a factor.
         points_world, shading, mask: with normals and albedo the maps that a light falls on; grey ones.
     """
 
-    def __init__(self, portrait: Portrait, surfels: int = _SURFELS, directions: int = _DIRECTIONS) -> None:
-        """Finds it; a second or two on two cores for the default numbers."""
-        points, normals = portrait.points, portrait.normals_world
-        side = portrait.spacing * max(1.0, math.sqrt(len(points) / surfels))
+    def __init__(
+        self,
+        surface: Reflecting,
+        factor: float = 1.0,
+        surfels: int = _SURFELS,
+        directions: int = _DIRECTIONS,
+    ) -> None:
+        """Finds it, for the surface's albedo times a factor; a second or two on two cores for the default
+        numbers."""
+        points, normals = surface.points, surface.normals_world
+        side = surface.spacing * max(1.0, math.sqrt(len(points) / surfels))
         member, self.ids = _surfels(points, normals, side)
         sums = torch.zeros(len(self.ids), 7, device=points.device, dtype=points.dtype)
-        rows = torch.cat([normals, portrait.albedo, torch.ones_like(points[:, :1])], dim=1)
+        rows = torch.cat([normals, factor * surface.albedo, torch.ones_like(points[:, :1])], dim=1)
         sums.index_add_(0, member, rows)
         self.normals_world = torch.nn.functional.normalize(sums[:, :3], dim=1)
         self.albedo = (sums[:, 3:6] / sums[:, 6:]).clamp(0.0, 1.0)
-        self.excess = torch.zeros_like(self.albedo)
         self.points_world = points[self.ids]
         self.shading = self.mask = torch.ones_like(self.points_world[:, 0])
         self._points, self._side = points, side
@@ -72,38 +91,21 @@ class Interreflection:
         self._near: tuple[torch.Tensor, torch.Tensor] | None = None
 
     def indirect(self, direct: torch.Tensor) -> torch.Tensor:
-        """Light that arrives from other parts of the subject, [S, C], after up to three bounces.
+        """Light that arrives from other parts of the subject, [S, C] or [S, K, C], after up to three bounces.
 
         Args:
-            direct: [S, C], what arrives from the light itself; both as the radiance of a white surface.
+            direct: [S, C] of one light or [S, K, C] of several, what arrives from the light itself; both as
+                the radiance of a white surface.
         """
-        return self._bounced(direct, self.albedo)
-
-    def _bounced(self, direct: torch.Tensor, albedo: torch.Tensor) -> torch.Tensor:
-        indirect = torch.zeros_like(direct)
+        albedo = self.albedo if direct.ndim == 2 else self.albedo[:, None]
+        indirect = torch.zeros_like(direct, memory_format=torch.contiguous_format)
         for _ in range(_BOUNCES):
-            indirect = self._transport(albedo * (direct + indirect))
+            sent = albedo * (direct + indirect)
+            indirect = self._transport(sent.flatten(1)).view_as(indirect)
         return indirect
 
-    def take_out_of_albedo(self, lit: torch.Tensor) -> None:
-        """Finds `excess`, and takes it out of the albedo.
-
-        Where the flash was is not known here: any direction from which it may have lit a surfel counts, as
-        in the least squares of the fit by the square of its direct light.
-
-        Args:
-            lit: [K, S], direct light from the directions, over that at normal incidence.
-        """
-        fitted, square = self.albedo, (lit**2).sum(dim=0)[:, None]
-        direct = lit.T.contiguous()
-        for _ in range(2):  # the bounce itself was reckoned with too high an albedo
-            bounced = [self._bounced(direct, albedo[:, None]) for albedo in self.albedo.unbind(1)]
-            along = torch.stack([(direct * indirect).sum(dim=1) for indirect in bounced], dim=1)
-            self.excess = torch.where(square > 0, along / square.clamp(min=_LEAST_LIT), 0.0)
-            self.albedo = fitted / (1.0 + self.excess)
-
     def of_points(self, values: torch.Tensor, ids: torch.Tensor) -> torch.Tensor:
-        """Values [S, C] of the surfels at some points [N] of the portrait, from those beside each: [N, C]."""
+        """Values [S, C] of the surfels at some points [N], from those beside each: [N, C]."""
         if self._near is None:
             self._near = self._beside()
         near, weight = self._near

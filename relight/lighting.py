@@ -13,9 +13,9 @@ unit direction from a point to a light, V in 0..1 is how much of a light a point
     sh            A / pi max(0, [n 1] M [n 1]^T)
 
 A light that casts shadows also bounces: what arrives by way of other parts of the subject is added to the
-term that A multiplies, and A is then that without the bounce of the capture's own flash
-(`relight.interreflection`). With a reflectance point lights and environments have its gloss and its
-retro-reflection too.
+term that A multiplies (`relight.interreflection`). So does the capture's flash: near the camera it is a
+factor that comes with the portrait (`relight.flash_bounces`). With a reflectance point lights and
+environments have its gloss and its retro-reflection too.
 
 The flash casts no shadow: what it does not reach is hidden from the camera beside it (paper, eq. 4). Where
 the normal is zero all terms with n are zero, and the room's and the ambient term remain; `surface` says what
@@ -134,7 +134,8 @@ class CaptureLight:
         if self.flash_offset_cam_m is not None:
             cam_from_world = surface.vector(self.camera.cam_from_world[:3, :3])
             position = position + surface.vector(self.flash_offset_cam_m) @ cam_from_world
-        radiance = surface.vector(self.c_flash) * self.response(surface, position) * surface.flash_gain
+        radiance = surface.vector(self.c_flash) * self.response(surface, position, surface.flash_albedo)
+        radiance = radiance * surface.flash_gain
         if self.lamp is None or self.lamp.falloff == 0:
             return radiance
         to_light, _ = direction_to(surface.points, position)
@@ -226,11 +227,9 @@ class DirectionalLight(Light):
 
     def radiance(self, surface: Surface, capture: CaptureLight) -> Tensor:  # noqa: D102
         arriving: Tensor = self.ambient + (1.0 - self.ambient) * self._direct(surface)
-        albedo = surface.albedo
         if self.shadows:
             arriving = arriving + (1.0 - self.ambient) * surface.indirect(self, self._direct)
-            albedo = surface.bare_albedo
-        return albedo * surface.vector(self.color) * arriving
+        return surface.albedo * surface.vector(self.color) * arriving
 
     def _direct(self, surface: Surface) -> Tensor:
         """V max(0, <n, l>), [P, 3]."""
@@ -265,9 +264,8 @@ class PointLight(Light):
         position = surface.vector(self.position)
         if not self.shadows:
             return surface.vector(self.C) * capture.response(surface, position)
-        albedo = surface.bare_albedo
-        direct = capture.response(surface, position, albedo) * self._visible(surface, position)
-        return surface.vector(self.C) * direct + albedo * surface.indirect(self, self._direct)
+        direct = capture.response(surface, position) * self._visible(surface, position)
+        return surface.vector(self.C) * direct + surface.albedo * surface.indirect(self, self._direct)
 
     def _direct(self, surface: Surface) -> Tensor:
         """C / d^2 V max(0, <n, l>), [P, 3]."""
@@ -354,7 +352,7 @@ class EnvironmentLight(Light):
             gloss = gloss * share
         if not self.shadows:
             return surface.albedo * direct + gloss
-        return surface.bare_albedo * (direct + surface.indirect(self, self._direct)) + gloss
+        return surface.albedo * (direct + surface.indirect(self, self._direct)) + gloss
 
     def _direct(self, surface: Surface) -> Tensor:
         """Radiance of a white surface [P, 3], with shadows."""

@@ -37,7 +37,7 @@ _CELL, _TOLERANCE = 2.4, 5.0  # of the visibility test, in spacings: finer than 
 _ENCLOSED_SHARE = 0.01  # of the mask: larger enclosed gaps are the subject's, e.g. under a bent arm
 _MARGIN_PX = 4  # of a splat, the closing of gaps and the mask's soft edge
 _COARSE_PX = 32  # of a level that fills gaps; wider ones are rare
-_VALUES = 13  # of a pixel: normal, albedo, room radiance, shading, confidence, gloss, depth
+_VALUES = 14  # of a pixel: normal, albedo, room radiance, shading, confidence, gloss, bounce, depth
 _ID_LEVELS = 4  # pixels without a point of their own take that of a coarser level
 
 
@@ -56,6 +56,7 @@ class Maps:
         points_world: [H, W, 3] world.
         confidence: [H, W] 0..1.
         gloss: [H, W] factor on the reflectance's f0.
+        flash_bounce: [H, W], see `Portrait.flash_bounce`.
         point_ids: [H, W] int64, a point of the portrait seen in or near the pixel, -1 off the subject.
         flash_radiance: [H, W, 3] linear radiance that the camera's own flash adds, where a decoder has a
             light model of its own for it; None = it follows from the other maps.
@@ -71,6 +72,7 @@ class Maps:
     points_world: torch.Tensor
     confidence: torch.Tensor
     gloss: torch.Tensor
+    flash_bounce: torch.Tensor
     point_ids: torch.Tensor
     flash_radiance: torch.Tensor | None = None
     flash_gain: torch.Tensor | None = None
@@ -107,7 +109,7 @@ def splat_maps(portrait: Portrait, camera: Camera) -> Maps:
         values, mask, point_ids = _enlarged(values, mask, point_ids, camera)
     support = (mask > 0)[..., None]
     values = torch.where(support, values, 0.0)
-    normals, room, depth = values[..., :3], values[..., 6:9], values[..., 12]
+    normals, room, depth = values[..., :3], values[..., 6:9], values[..., 13]
     normals = normals / torch.linalg.vector_norm(normals, dim=-1, keepdim=True).clamp(min=1e-12)
     points = torch.where(support, unproject(depth, camera), 0.0)
     if portrait.room_gloss is not None:
@@ -125,6 +127,7 @@ def splat_maps(portrait: Portrait, camera: Camera) -> Maps:
         points_world=points,
         confidence=values[..., 10].clamp(0.0, 1.0),
         gloss=values[..., 11].clamp(min=0.0),
+        flash_bounce=values[..., 12].clamp(min=0.0),
         point_ids=point_ids,
     )
 
@@ -141,7 +144,7 @@ def _drawn_share(portrait: Portrait, camera: Camera) -> float:
 
 
 def _draw(portrait: Portrait, camera: Camera) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Values [H, W, 13], mask [H, W] and point ids [H, W] of a view."""
+    """Values [H, W, 14], mask [H, W] and point ids [H, W] of a view."""
     height, width = camera.height, camera.width
     sight = Sight(portrait.points, portrait.normals_world, camera, portrait.spacing, _CELL, _TOLERANCE)
     facing = (sight.cosine > _GRAZING).nonzero()[:, 0]
@@ -166,6 +169,7 @@ def _draw(portrait: Portrait, camera: Camera) -> tuple[torch.Tensor, torch.Tenso
             portrait.shading[seen, None],
             portrait.confidence[seen, None],
             portrait.gloss[seen, None],
+            portrait.flash_bounce[seen, None],
             z[:, None],
             torch.ones_like(z)[:, None],
         ],

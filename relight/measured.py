@@ -38,44 +38,63 @@ _GAIN_STEPS = 8  # a step carries gains to the frames that see the same points; 
 
 
 @dataclass(frozen=True, eq=False)
-class Measured:
-    """What the frames show of a surface.
+class Separated:
+    """What the frames show of points, the room's part and the flash's, as it is observed.
 
     Attributes:
         on_subject: [P] bool, False for what the masks carve away.
-        room: [P, 3] radiance under the room's light.
+        room: [P, 3] radiance under the room's light, mean over the views.
         room_information: [P] sum of weights that it rests on.
-        flash: In units of the albedo, with each point's gloss.
-        scale: Of C_flash.
-        gains: [K] of the flash frames.
-        reflectance: Of the subject.
-        relative: Standard deviation of a flash observation relative to its albedo.
+        flash: Its responses as of a flash of unit strength.
         tint: [3] colour of the flash, mean 1.
         level: Calibrated strength of the flash, None = unknown.
-        room_gloss: What of the room's light is not in `room`, for it moves with the camera.
     """
 
     on_subject: torch.Tensor
     room: torch.Tensor
     room_information: torch.Tensor
     flash: FlashPart
+    tint: list[float]
+    level: float | None
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """What all points of a surface share, and the flash's responses in terms of it.
+
+    Attributes:
+        on_subject: [P] bool, False for what the masks carve away.
+        flash: In units of the albedo, with each point's gloss.
+        scale: Of C_flash.
+        gains: [K] of the flash frames.
+        reflectance: Of the subject.
+        relative: Standard deviation of a flash observation relative to its albedo.
+    """
+
+    on_subject: torch.Tensor
+    flash: FlashPart
     scale: float
     gains: torch.Tensor
     reflectance: Reflectance
     relative: float
-    tint: list[float]
-    level: float | None
-    room_gloss: RoomGloss | None
+
+    def without(self, bounced: torch.Tensor) -> FlashPart:
+        """The flash's responses without some light [K, P, 3] in the same units, a part of them."""
+        seen = self.flash.weight[..., None] > 0
+        return replace(self.flash, response=torch.where(seen, self.flash.response - bounced, 0.0))
+
+    def as_observed(self, bounced: torch.Tensor) -> torch.Tensor:
+        """Light [K, P, 3] in the units of `Separated.flash`."""
+        return bounced * (self.scale * self.gains)[:, None, None]
 
 
-def measure(scene: Scene, surface: SurfaceCloud, observations: Observations, config: SolveConfig) -> Measured:
-    """Fits what all points of a surface share to what the frames show of them.
+def separate(scene: Scene, surface: SurfaceCloud, observations: Observations) -> Separated:
+    """Tells the flash from the room; it does not depend on the surface's normals.
 
     Raises:
-        PlanError: The frames do not show the surface, or are no brighter with the flash.
+        PlanError: The frames do not show the surface.
     """
     points = torch.from_numpy(surface.points).to(scene.device)
-    normals = torch.from_numpy(surface.normals_world).to(scene.device)
     # What masks carve away takes no part; it is dropped at the end, for a copy of the observations would be
     # large.
     on_subject = observations.outside <= _OUTSIDE_LIMIT
@@ -88,45 +107,68 @@ def measure(scene: Scene, surface: SurfaceCloud, observations: Observations, con
     room, room_information = room_radiance(observations)
     tint, level = _strength(scene.lamp)
     flash = flash_part(observations, points, room, room_information, points.new_tensor(tint))
-    scale, reflectance, gains = _global_quantities(flash, normals, config)
+    return Separated(on_subject, room, room_information, flash, tint, level)
+
+
+def measure(
+    separated: Separated,
+    surface: SurfaceCloud,
+    observations: Observations,
+    config: SolveConfig,
+    bounced: torch.Tensor | None = None,
+) -> Measured:
+    """Fits what all points of a surface share to what the frames show of them.
+
+    Args:
+        separated: Of the surface.
+        surface: With the normals to go by.
+        observations: Of the surface.
+        config: Of the solve.
+        bounced: [K, P, 3] what of the flash's responses came by way of other parts of the subject.
+
+    Raises:
+        PlanError: The frames are no brighter with the flash.
+    """
+    observed = separated.flash
+    points = torch.from_numpy(surface.points).to(observed.gloss.device)
+    normals = torch.from_numpy(surface.normals_world).to(observed.gloss.device)
+    if bounced is not None:
+        seen = observed.weight[..., None] > 0
+        observed = replace(observed, response=torch.where(seen, observed.response - bounced, 0.0))
+    scale, reflectance, gains = _global_quantities(observed, normals, config)
     lamps = observations.flash_position_world[observations.flash]
     if scale < BLACK * float(((lamps - points.mean(dim=0)) ** 2).sum(dim=1).median()):
         raise PlanError(
             f"The flash frames are no brighter than the others (by less than {BLACK} of white); is the "
             "flash flag of the frames right?"
         )
-    flash = _normalised(flash, scale, gains)
+    flash = replace(observed, response=observed.response / (scale * gains)[:, None, None])
     flash = replace(flash, gloss=_local_gloss(flash, points, normals, reflectance, surface.spacing))
     relative = _relative_noise(flash, normals, reflectance)
-    room_gloss = None
-    if config.room_gloss:
-        centres = [view.camera.centre_world for view in scene.views if view.flash == 0]
-        unlit = ~observations.flash
-        moving = (
-            points,
-            normals,
-            flash.gloss,
-            reflectance,
-            observations.radiance[unlit],
-            observations.cosine[unlit],
-            torch.from_numpy(np.stack(centres)).to(points),
-        )
-        room_gloss = fit_room_gloss(*moving)
-        if room_gloss is not None:
-            room = room - room_gloss.mean_radiance(*moving[:4], *moving[5:])
-    return Measured(
-        on_subject,
-        room,
-        room_information,
-        flash,
-        scale,
-        gains,
-        reflectance,
-        relative,
-        tint,
-        level,
-        room_gloss,
+    return Measured(separated.on_subject, flash, scale, gains, reflectance, relative)
+
+
+def measure_room_gloss(
+    scene: Scene, surface: SurfaceCloud, observations: Observations, separated: Separated, measured: Measured
+) -> tuple[torch.Tensor, RoomGloss | None]:
+    """The room's radiance [P, 3] without the gloss that moves with the view, and that gloss if there is
+    one."""
+    centres = [view.camera.centre_world for view in scene.views if view.flash == 0]
+    unlit = ~observations.flash
+    points = torch.from_numpy(surface.points).to(scene.device)
+    moving = (
+        points,
+        torch.from_numpy(surface.normals_world).to(scene.device),
+        measured.flash.gloss,
+        measured.reflectance,
+        observations.radiance[unlit],
+        observations.cosine[unlit],
+        torch.from_numpy(np.stack(centres)).to(points),
     )
+    gloss = fit_room_gloss(*moving)
+    if gloss is None:
+        return separated.room, None
+    return separated.room - gloss.mean_radiance(*moving[:4], *moving[5:]), gloss
 
 
 def _strength(lamp: Lamp) -> tuple[list[float], float | None]:
@@ -178,12 +220,6 @@ def _frame_gains(
             model = albedo[used] * diffuse[k, used] + gloss[k, used]
             gains[k] = (response[k, used] / model).median()
     return (gains / gains.median()).clamp(0.5, 2.0)
-
-
-def _normalised(flash: FlashPart, scale: float, gains: torch.Tensor) -> FlashPart:
-    """The observations in units of the albedo; in place, for a copy would be large."""
-    flash.response.mul_((1.0 / (scale * gains))[:, None, None])
-    return flash
 
 
 def _local_gloss(

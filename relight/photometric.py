@@ -17,6 +17,8 @@ no-flash frame a point shows its room radiance; a flash frame adds
    or, with `SolveConfig.shape`, as those of a surface that bends until its shading fits
    (`relight.shape_from_flash`), with which steps 1 and 2 are then done again;
 4. albedo: robust least squares per channel;
+   with `SolveConfig.bounces` what came by way of other parts of the subject is taken off before 3 and 4
+   (`relight.flash_bounces`);
 5. points that the flash did not reach are filled, on a face from its other side (`relight.mirror_infill`),
    else from their neighbours (`relight.infill`).
 
@@ -41,13 +43,14 @@ import torch
 
 from relight.cloud import CloudConfig, SurfaceCloud, prepare_cloud
 from relight.errors import PlanError
+from relight.flash_bounces import FlashBounces, flash_bounces
 from relight.flash_part import BLACK, FlashPart, chunks
 from relight.infill import infill
 from relight.lamp import beam_as_json
 from relight.measured import ALBEDO_95 as ALBEDO_95
-from relight.measured import Measured, measure
+from relight.measured import Measured, measure, measure_room_gloss, separate
 from relight.mirror_infill import mirror_infill
-from relight.observations import observe_points
+from relight.observations import Observations, observe_points
 from relight.point_fits import fit_albedo, fit_normals
 from relight.portrait import Portrait
 from relight.reflectance import Reflectance
@@ -72,6 +75,8 @@ class SolveConfig:
         mirror: Whether what no flash reached of a face is taken from its other side, before its neighbours.
         shape: How the cloud's surface is made to fit its shading (`relight.shape_from_flash`); None = it
             stays as the cloud has it, and only normals are fitted.
+        bounces: Whether the flash's light that came by way of other parts of the subject is told from the
+            rest (`relight.flash_bounces`); otherwise the albedo has it.
         room_gloss: Whether the gloss of the room's light, which moves with the camera, is fitted
             (`relight.room_gloss`); otherwise the room is the mean over the views.
         known: Information (sum of weighted squared cosines over the flash frames) that makes an albedo
@@ -84,6 +89,7 @@ class SolveConfig:
     fit_gains: bool = True
     mirror: bool = True
     shape: ShapeConfig | None = None
+    bounces: bool = True
     room_gloss: bool = False
     known: float = 0.25
 
@@ -112,11 +118,20 @@ def solve(scene: Scene, config: SolveConfig = SolveConfig(), progress: Progress 
     progress("cloud", 1.0)
     observations = observe_points(scene, surface, progress)
     progress("solve", 0.0)
+    separated = separate(scene, surface, observations)
+    measured = measure(separated, surface, observations, config)
+    flash, bounces, bounced = measured.flash, None, None
+    if config.bounces:
+        bounces, bounced = _bounces(surface, measured, observations, separated.level, config)
+        flash, bounced = measured.without(bounced), measured.as_observed(bounced)
     if config.shape is not None:
-        measured = measure(scene, surface, observations, replace(config, room_gloss=False))
-        surface = _shaped(surface, measured, config.shape, progress)
+        surface = _shaped(surface, flash, measured, config.shape, progress)
         progress("solve", 0.0)
-    measured = measure(scene, surface, observations, config)
+    if config.bounces or config.shape is not None:
+        measured = measure(separated, surface, observations, config, bounced)
+    room, room_gloss = separated.room, None
+    if config.room_gloss:
+        room, room_gloss = measure_room_gloss(scene, surface, observations, separated, measured)
     flash, relative, reflectance = measured.flash, measured.relative, measured.reflectance
     points = torch.from_numpy(surface.points).to(scene.device)
     prior = torch.from_numpy(surface.normals_world).to(scene.device)
@@ -131,22 +146,23 @@ def solve(scene: Scene, config: SolveConfig = SolveConfig(), progress: Progress 
             chunk, normals[part], reflectance, relative
         )
         progress("solve", part.stop / len(points))
-    known = information > config.known
-    if not bool(known.any()):
-        raise PlanError(
-            "The flash frames do not light any point enough to solve for it; is the flash flag of the frames "
-            "right, and is the subject what the flash lights?"
-        )
-    room, room_information = measured.room, measured.room_information
+    known = _known(information, config)
     filled, worth, from_mirror = albedo, information, 0.0
     if config.mirror and float(known.float().mean()) < 1.0 - _MIRROR_WORTH:
         mirrored = mirror_infill(scene, points, normals, albedo, information, config.known)
         filled, worth = mirrored.values, mirrored.information
         from_mirror = float(mirrored.filled.float().mean())
     albedo = infill(points, filled, worth, known=config.known, nearest=surface.spacing)
-    room = infill(points, room, room_information, known=0.3, nearest=surface.spacing)
-    gauge, warnings = _gauge(albedo[known].mean(dim=1), measured.scale, measured.level)
+    room = infill(points, room, separated.room_information, known=0.3, nearest=surface.spacing)
+    gauge, warnings = _gauge(albedo[known].mean(dim=1), measured.scale, separated.level)
     albedo = (albedo * gauge).clamp(min=0.0)
+    bounce = torch.zeros_like(information)
+    if bounces is not None:
+        excess = bounces.excess(flash.weight, reflectance.diffuse(flash.cosine(normals)))
+        bounce = (excess * albedo).sum(dim=1) / (albedo * albedo).sum(dim=1).clamp(min=BLACK**2)
+        bounce = infill(points, bounce[:, None], information, known=config.known, nearest=surface.spacing)[
+            :, 0
+        ].clamp(min=0.0)
     c_room, shading = _split_room(room, albedo, information > config.known)
     alike = _alike(flash, reflectance)
     normal_sigma = _normal_sigma(information / alike, relative, config.normal_sigma_rad)
@@ -161,15 +177,17 @@ def solve(scene: Scene, config: SolveConfig = SolveConfig(), progress: Progress 
         room_radiance=room.clamp(min=0.0),
         shading=shading,
         gloss=flash.gloss,
+        flash_bounce=bounce,
         confidence=share / (1.0 + share),
         albedo_sigma=(sigma * gauge).clamp(max=1.0),
         normal_sigma_rad=normal_sigma,
         residual=residual,
         spacing=surface.spacing,
         c_room=_three(c_room),
-        c_flash=_three([measured.scale / gauge * share for share in measured.tint]),
+        c_flash=_three([measured.scale / gauge * share for share in separated.tint]),
         flash_offset_cam_m=_three(torch.as_tensor(scene.flash_offset_cam_m)),
         reflectance=Reflectance(reflectance.retro, reflectance.alpha, reflectance.f0 * gauge),
+        bounce_scale=1.0 if bounces is None else bounces.scale,
         info={
             "solver": "photometric",
             "frames": len(scene.views),
@@ -180,20 +198,51 @@ def solve(scene: Scene, config: SolveConfig = SolveConfig(), progress: Progress 
             "known_share": round(float(known.float().mean()), 4),
             "mirrored_share": round(from_mirror, 4),
             "flash_beam": beam_as_json(scene.lamp),
-            "absolute_albedo": measured.level is not None and not warnings,
+            "absolute_albedo": separated.level is not None and not warnings,
             "warnings": warnings,
         },
-        room_gloss=measured.room_gloss,
+        room_gloss=room_gloss,
     )
-    return portrait if bool(measured.on_subject.all()) else portrait.subset(measured.on_subject)
+    return portrait if bool(separated.on_subject.all()) else portrait.subset(separated.on_subject)
+
+
+def _known(information: torch.Tensor, config: SolveConfig) -> torch.Tensor:
+    """[P] bool, points whose albedo the flash frames tell.
+
+    Raises:
+        PlanError: There are none.
+    """
+    known = information > config.known
+    if not bool(known.any()):
+        raise PlanError(
+            "The flash frames do not light any point enough to solve for it; is the flash flag of the frames "
+            "right, and is the subject what the flash lights?"
+        )
+    return known
+
+
+def _bounces(
+    surface: SurfaceCloud,
+    measured: Measured,
+    observations: Observations,
+    level: float | None,
+    config: SolveConfig,
+) -> tuple[FlashBounces, torch.Tensor]:
+    """What the flash throws on points by way of others, for white ones and [K, P, 3] for what they are."""
+    points = torch.from_numpy(surface.points).to(measured.flash.gloss.device)
+    normals = torch.from_numpy(surface.normals_world).to(points.device)
+    albedo, information, _, _ = fit_albedo(measured.flash, normals, measured.reflectance, measured.relative)
+    known = _known(information, config)
+    gauge, _ = _gauge(albedo[known].mean(dim=1), measured.scale, level)
+    bounces = flash_bounces(points, normals, surface.spacing, albedo, gauge, known, measured, observations)
+    return bounces, bounces.light * albedo.clamp(min=0.0)
 
 
 def _shaped(
-    surface: SurfaceCloud, measured: Measured, config: ShapeConfig, progress: Progress
+    surface: SurfaceCloud, flash: FlashPart, measured: Measured, config: ShapeConfig, progress: Progress
 ) -> SurfaceCloud:
     """The surface with the normals that explain the shading under the flash."""
     progress("shape", 0.0)
-    flash = measured.flash
     shape = refine_shape(
         torch.from_numpy(surface.points).to(flash.gloss.device),
         torch.from_numpy(surface.normals_world).to(flash.gloss.device),

@@ -28,13 +28,13 @@ from relight.errors import PortraitError
 from relight.reflectance import Reflectance
 from relight.room_gloss import RoomGloss
 
-VERSION = 2
-"""1 had no decoder; it is still read."""
+VERSION = 3
+"""1 had no decoder, 2 no light that bounced under the flash; both are still read."""
 
 TENSORS_FILE = "portrait.safetensors"
 FIELDS_FILE = "portrait.json"
 
-_READ = (1, VERSION)
+_READ = (1, 2, VERSION)
 _DECODER = "decoder."  # before the names of its tensors
 
 _TENSORS = {
@@ -44,6 +44,7 @@ _TENSORS = {
     "room_radiance": 3,
     "shading": 0,
     "gloss": 0,
+    "flash_bounce": 0,
     "confidence": 0,
     "albedo_sigma": 0,
     "normal_sigma_rad": 0,
@@ -64,6 +65,8 @@ class Portrait:
             The paper's A * C_room * s is its grey approximation.
         shading: [P] room shading s, 0..1.
         gloss: [P] factor on the reflectance's f0: cloth has less of it than skin.
+        flash_bounce: [P] what came of the capture's flash by way of other parts of the subject, over what
+            came from it straight, for an albedo of 1 (`relight.flash_bounces`).
         confidence: [P] 0..1, how well the flash observed the point; 0 = filled in from neighbours.
         albedo_sigma: [P] standard error of the albedo (mean of channels), infinite nowhere: 1 where unknown.
         normal_sigma_rad: [P] standard error of the normal, radians.
@@ -73,6 +76,8 @@ class Portrait:
         c_flash: [3] colour of the flash: radiance of a white surface that faces it from a distance of 1.
         flash_offset_cam_m: [3] lens to flash in camera axes.
         reflectance: Of the whole subject.
+        bounce_scale: Factor on the albedo with which light bounces within the subject as strongly as the
+            frames show; the albedo's own scale is a convention.
         info: Free-form facts: software, source, settings, warnings.
         decoder: What makes the maps of a view; None = the points are splatted.
         room_gloss: What a view adds to `room_radiance` for the gloss that moves with it; None = nothing.
@@ -84,6 +89,7 @@ class Portrait:
     room_radiance: torch.Tensor
     shading: torch.Tensor
     gloss: torch.Tensor
+    flash_bounce: torch.Tensor
     confidence: torch.Tensor
     albedo_sigma: torch.Tensor
     normal_sigma_rad: torch.Tensor
@@ -93,6 +99,7 @@ class Portrait:
     c_flash: tuple[float, float, float]
     flash_offset_cam_m: tuple[float, float, float]
     reflectance: Reflectance
+    bounce_scale: float
     info: Mapping[str, Any]
     decoder: Decoder | None = None
     room_gloss: RoomGloss | None = None
@@ -190,6 +197,8 @@ def load_portrait(folder: Path, device: torch.device | str = "cpu") -> Portrait:
         count = int(content["points"])
         if count < 1:
             raise ValueError("it has no points")
+        if version < 3:
+            tensors["flash_bounce"], content["bounce_scale"] = torch.zeros_like(tensors["gloss"]), 1.0
         for name, width in _TENSORS.items():
             shape, values = (count, width) if width else (count,), tensors[name]
             if tuple(values.shape) != shape or values.dtype != torch.float32 or not values.isfinite().all():
@@ -201,6 +210,7 @@ def load_portrait(folder: Path, device: torch.device | str = "cpu") -> Portrait:
             c_flash=_vector(content["c_flash"]),
             flash_offset_cam_m=_vector(content["flash_offset_cam_m"]),
             reflectance=_reflectance(**content["reflectance"]),
+            bounce_scale=_not_negative(content["bounce_scale"]),
             info=dict(content["info"]),
             decoder=_decoder(content["decoder"], tensors) if version > 1 else None,
             room_gloss=_room_gloss(content.get("room_gloss")),
@@ -227,6 +237,13 @@ def _positive(value: Any) -> float:
     number = float(value)
     if not 0.0 < number < math.inf:
         raise ValueError(f"{number} is not a finite number above 0")
+    return number
+
+
+def _not_negative(value: Any) -> float:
+    number = float(value)
+    if not 0.0 <= number < math.inf:
+        raise ValueError(f"{number} is not a finite number of at least 0")
     return number
 
 

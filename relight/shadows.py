@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from relight.interreflection import Interreflection, even_directions, spiral
+from relight.interreflection import Interreflection, Reflecting, spiral
 from relight.maps import Maps
 from relight.portrait import Portrait
 from relight.surface import Surface
@@ -42,7 +42,6 @@ _STEEPEST = (
 )
 _LARGEST_SIDE = 4096  # cells
 _SMALL_LIGHTS = 48  # over the disc of a light with a size: steps of a penumbra under two hundredths
-_FLASHES = 16  # directions that stand for those in which a capture's flash was
 
 _Coordinates = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
 Arriving = Callable[[Surface], torch.Tensor]
@@ -128,16 +127,7 @@ class ShadowCaster:
     @cached_property
     def interreflection(self) -> Interreflection:
         """What the subject's parts see of each other; found when first asked for, in a second or two."""
-        found = Interreflection(self.portrait)
-        surfels = found.points_world, found.normals_world
-        ball = even_directions(_FLASHES).to(self.portrait.points)
-        lit = [
-            (found.normals_world @ to_light).clamp(min=0.0)
-            * _from_afar(self.portrait, to_light, _CELL_MANY).map.visible(*surfels, soft=False)
-            for to_light in ball
-        ]
-        found.take_out_of_albedo(torch.stack(lit))
-        return found
+        return Interreflection(self.portrait, self.portrait.bounce_scale)
 
     def indirect(self, light: Light, arriving: Arriving) -> torch.Tensor:
         """What of a light comes to the surfels from other parts of the subject, [S, C], as the radiance of a
@@ -189,11 +179,6 @@ class ViewVisibility:
         """[H, W, C] of a light by way of other parts of the subject; 0 off the subject."""
         return self._of_surfels(self._caster.indirect(light, arriving))
 
-    @cached_property
-    def albedo_excess(self) -> torch.Tensor:
-        """[H, W, 3], see `Interreflection.excess`; 0 off the subject."""
-        return self._of_surfels(self._caster.interreflection.excess)
-
     def _of_surfels(self, values: torch.Tensor) -> torch.Tensor:
         on = self._maps.point_ids >= 0
         result = values.new_zeros(*on.shape, values.shape[1])
@@ -235,10 +220,6 @@ class _SurfelVisibility:
         return self._caster.environment(directions, irradiances)[self._surfels.ids]
 
     def indirect(self, light: Light, arriving: Arriving) -> None:
-        return None
-
-    @property
-    def albedo_excess(self) -> None:
         return None
 
     def _seen(self, depth_map: _DepthMap) -> torch.Tensor:
@@ -309,7 +290,14 @@ class _LightView:
         return self.map.visible_at(self.coordinates, self.normals, soft=False)
 
 
-def _from_point(portrait: Portrait, position: torch.Tensor) -> _LightView:
+def seen_from(
+    surface: Reflecting, position: torch.Tensor, points: torch.Tensor, normals: torch.Tensor
+) -> torch.Tensor:
+    """[N] 0 or 1, whether some points [N, 3] with unit normals [N, 3] are seen from [3] past a surface."""
+    return _from_point(surface, position).map.visible(points, normals, soft=False)
+
+
+def _from_point(portrait: Reflecting, position: torch.Tensor) -> _LightView:
     position = position.to(portrait.points)
     centre = portrait.points.mean(dim=0)
     axis = centre - position
@@ -320,13 +308,13 @@ def _from_point(portrait: Portrait, position: torch.Tensor) -> _LightView:
     return _build(portrait, _frame(axis), position, cell, _CELL * portrait.spacing)
 
 
-def _from_afar(portrait: Portrait, to_light: torch.Tensor, cell: float) -> _LightView:
+def _from_afar(portrait: Reflecting, to_light: torch.Tensor, cell: float) -> _LightView:
     size = cell * portrait.spacing
     return _build(portrait, _frame(-to_light.to(portrait.points)), None, size, size)
 
 
 def _build(
-    portrait: Portrait, axes: torch.Tensor, position: torch.Tensor | None, cell: float, cell_size: float
+    portrait: Reflecting, axes: torch.Tensor, position: torch.Tensor | None, cell: float, cell_size: float
 ) -> _LightView:
     coordinates = _coordinates(portrait.points, axes, position)
     grid, depth, _ = coordinates

@@ -67,7 +67,7 @@ class ShapeConfig:
     bend_sigma: float = 0.05
     coarse_rounds: int = 3
     coarse_iterations: int = 40
-    rounds: int = 1
+    rounds: int = 2
     iterations: int = 20
 
 

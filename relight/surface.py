@@ -28,8 +28,9 @@ class SurfaceMaps(Protocol):
 
     Maps may also have a `room_radiance` [..., 3], linear: what the room's light makes of the surface, in
     colour. It then takes the place of albedo * C_room * shading. Likewise a `flash_radiance` [..., 3], what
-    the camera's own flash adds, or a `flash_gain` [..., 3], a factor on it. And a `gloss` [...], a factor on
-    the gloss of a reflectance.
+    the camera's own flash adds, or a `flash_gain` [..., 3], a factor on it; and a `flash_bounce` [...], what
+    comes of that flash by way of other parts of the subject, over what comes from it straight, to a surface
+    of albedo 1. And a `gloss` [...], a factor on the gloss of a reflectance.
     """
 
     @property
@@ -74,11 +75,6 @@ class Visibility(Protocol):
         `arriving` is what comes from the light itself, to any surface; None where that is not offered.
         """
 
-    @property
-    def albedo_excess(self) -> Tensor | None:
-        """[..., C], share by which the albedo holds light that bounced under the capture's flash; with
-        `indirect`."""
-
 
 class Surface:
     """The P points of some maps where the mask is above 0, gathered when first asked for."""
@@ -117,6 +113,15 @@ class Surface:
         """[P, 3], factor on the radiance of the camera's own flash; 1 where the maps know of none."""
         gain = getattr(self._maps, "flash_gain", None)
         return 1.0 if gain is None else self._gather(gain)
+
+    @cached_property
+    def flash_albedo(self) -> Tensor:
+        """[P, 3], the albedo, brighter by what the camera's own flash throws on the point by way of
+        others."""
+        bounce = getattr(self._maps, "flash_bounce", None)
+        if bounce is None:
+            return self.albedo
+        return self.albedo * (1.0 + self._gather(bounce[..., None]) * self.albedo)
 
     @cached_property
     def flash_radiance(self) -> Tensor | None:
@@ -163,12 +168,6 @@ class Surface:
         """[P, C], what comes of a light by way of other parts of the subject; 0 where that is not offered."""
         indirect = None if self._visibility is None else self._visibility.indirect(light, arriving)
         return 0.0 if indirect is None else self._gather(indirect.to(self._maps.albedo))
-
-    @cached_property
-    def bare_albedo(self) -> Tensor:
-        """[P, 3], the albedo to go with `indirect`: without the bounce of the capture's flash."""
-        excess = None if self._visibility is None else self._visibility.albedo_excess
-        return self.albedo if excess is None else self.albedo / (1.0 + self._gather(excess.to(self.albedo)))
 
     def scatter(self, values: Tensor) -> Tensor:
         """Values [P, C] of the points back in the maps' shape, [..., C], 0 elsewhere."""

@@ -149,6 +149,7 @@ def portrait(count: int = 3000, dtype: torch.dtype = torch.float32, points: Floa
         room_radiance=tensor(SUBJECT.room * albedo),
         shading=0.5 * ones,
         gloss=ones.clone(),
+        flash_bounce=torch.zeros_like(ones),
         confidence=ones.clone(),
         albedo_sigma=0.01 * ones,
         normal_sigma_rad=0.01 * ones,
@@ -158,5 +159,6 @@ def portrait(count: int = 3000, dtype: torch.dtype = torch.float32, points: Floa
         c_flash=(SUBJECT.flash,) * 3,
         flash_offset_cam_m=tuple(FLASH_OFFSET_CAM_M.tolist()),
         reflectance=Reflectance(0.25, 0.25, 0.04),
+        bounce_scale=1.0,
         info={},
     )

@@ -39,6 +39,7 @@ PORTRAIT_TENSORS = {
     "room_radiance": 3,
     "shading": 0,
     "gloss": 0,
+    "flash_bounce": 0,
     "confidence": 0,
     "albedo_sigma": 0,
     "normal_sigma_rad": 0,
@@ -313,19 +314,22 @@ def write_session(path: Path, frames: Sequence[Frame], cloud: PointCloud, *, tra
 
 
 def portrait_of(points, normals, spacing, **given) -> Portrait:
-    """A portrait of points [P, 3] and normals [P, 3], all else 1 (colours 0.1) where it is not given."""
+    """A portrait of points [P, 3] and normals [P, 3], all else 1 (colours 0.1, no bounces) where it is not
+    given."""
     tensors = {"points": points, "normals_world": normals} | {
         name: given.pop(name) for name in list(given) if name in PORTRAIT_TENSORS
     }
     count = len(points)
     for name, width in PORTRAIT_TENSORS.items():
-        value = torch.as_tensor(np.asarray(tensors.get(name, 1.0)), dtype=torch.float32)
+        usual = 0.0 if name == "flash_bounce" else 1.0
+        value = torch.as_tensor(np.asarray(tensors.get(name, usual)), dtype=torch.float32)
         tensors[name] = value.expand(count, width).clone() if width else value.expand(count).clone()
     numbers = {
         "c_room": (0.1, 0.1, 0.1),
         "c_flash": (0.1, 0.1, 0.1),
         "flash_offset_cam_m": (0.0, 0.0, 0.0),
         "reflectance": Reflectance(),
+        "bounce_scale": 1.0,
         "info": {},
     }
     return Portrait(**tensors, spacing=spacing, **(numbers | given))

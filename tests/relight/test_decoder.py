@@ -58,6 +58,20 @@ def test_a_portrait_of_version_1_is_read_and_has_no_decoder(tmp_path):
     assert load_portrait(tmp_path).decoder is None
 
 
+def test_a_portrait_of_version_2_is_read_and_knows_no_bounce_under_the_flash(tmp_path):
+    decoded(50).save(tmp_path)
+    content = json.loads((tmp_path / FIELDS_FILE).read_text())
+    del content["bounce_scale"]
+    tensors = load_file(tmp_path / TENSORS_FILE)
+    del tensors["flash_bounce"]
+    save_file(tensors, tmp_path / TENSORS_FILE)
+    (tmp_path / FIELDS_FILE).write_text(json.dumps(content | {"version": 2}))
+    old = load_portrait(tmp_path)
+    assert old.decoder is not None
+    assert old.bounce_scale == 1.0
+    assert not old.flash_bounce.any()
+
+
 def test_a_decoder_is_subset_moved_and_transformed_with_its_portrait():
     portrait = decoded(10)
     keep = torch.arange(10) < 4

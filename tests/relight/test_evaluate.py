@@ -41,6 +41,7 @@ def sphere_portrait(count=30_000):
         room_radiance=albedo * torch.tensor(C_ROOM),
         shading=torch.ones(count),
         gloss=torch.ones(count),
+        flash_bounce=torch.zeros(count),
         confidence=torch.ones(count),
         albedo_sigma=torch.zeros(count),
         normal_sigma_rad=torch.zeros(count),
@@ -50,6 +51,7 @@ def sphere_portrait(count=30_000):
         c_flash=(0.1, 0.1, 0.1),
         flash_offset_cam_m=(0.0, 0.0, 0.0),
         reflectance=Reflectance(),
+        bounce_scale=1.0,
         info={},
     )
 

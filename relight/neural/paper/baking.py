@@ -63,9 +63,10 @@ def baked(
     length = torch.linalg.vector_norm(normal, dim=1)
     turned = known & (length > 0.1)  # frames that contradict each other leave the solve's
     spread = (squared[:, 0] - albedo.mean(dim=1) ** 2).clamp(min=0.0).sqrt()
+    scale = _scale(albedo, solved.albedo, known)
     return replace(
         solved,
-        albedo=torch.where(known[:, None], albedo, solved.albedo * _scale(albedo, solved.albedo, known)),
+        albedo=torch.where(known[:, None], albedo, solved.albedo * scale),
         normals_world=torch.where(
             turned[:, None], normal / length.clamp(min=1e-6)[:, None], solved.normals_world
         ),
@@ -79,6 +80,8 @@ def baked(
         c_flash=_vector(c_flash),
         flash_offset_cam_m=(0.0, 0.0, 0.0),
         reflectance=Reflectance(),
+        flash_bounce=torch.zeros_like(solved.flash_bounce),  # it has no bounces
+        bounce_scale=solved.bounce_scale / max(float(scale.mean()), 1e-3),
         room_gloss=None,
         decoder=decoder,
     )

@@ -69,6 +69,7 @@ class PaperDecoder(Decoder):
             points_world=torch.where(support, unproject(depth, camera), 0.0),
             confidence=torch.where(support[..., 0], splats.confidence, 0.0),
             gloss=torch.where(support[..., 0], splats.gloss, 0.0),
+            flash_bounce=torch.zeros_like(splats.gloss),
             point_ids=torch.where(support[..., 0], splats.point_ids, -1),
             flash_radiance=flash,
         )

@@ -9,7 +9,7 @@ import torch
 from capture.cameras import Camera
 from relight.maps import Maps, unproject
 
-STACKED = 13
+STACKED = 14
 """Channels of a view's maps that are kept."""
 
 FEATURES = 18
@@ -33,6 +33,7 @@ class Layers:
         room_radiance: [H, W, 3].
         confidence: [H, W].
         gloss: [H, W].
+        flash_bounce: [H, W].
         mask: [H, W].
         points_world: [H, W, 3].
         flash_gain: [H, W, 3], factor on what the camera's own flash adds.
@@ -43,6 +44,7 @@ class Layers:
     room_radiance: torch.Tensor
     confidence: torch.Tensor
     gloss: torch.Tensor
+    flash_bounce: torch.Tensor
     mask: torch.Tensor
     points_world: torch.Tensor
     flash_gain: torch.Tensor
@@ -61,6 +63,7 @@ def layers_of(maps: Maps) -> Layers:
         maps.room_radiance,
         maps.confidence,
         maps.gloss,
+        maps.flash_bounce,
         maps.mask,
         maps.points_world,
         torch.ones_like(maps.albedo),
@@ -68,8 +71,9 @@ def layers_of(maps: Maps) -> Layers:
 
 
 def stacked(maps: Maps) -> torch.Tensor:
-    """[STACKED, H, W] of a view: albedo, normal, room radiance, confidence, gloss, mask, depth."""
-    singles = torch.stack([maps.confidence, maps.gloss, maps.mask, maps.depth], dim=-1)
+    """[STACKED, H, W] of a view: albedo, normal, room radiance, confidence, gloss, bounce, mask,
+    depth."""
+    singles = torch.stack([maps.confidence, maps.gloss, maps.flash_bounce, maps.mask, maps.depth], dim=-1)
     layers = [maps.albedo, maps.normals_world, maps.room_radiance, singles]
     return torch.cat(layers, dim=-1).permute(2, 0, 1).contiguous()
 
@@ -77,11 +81,11 @@ def stacked(maps: Maps) -> torch.Tensor:
 def unstacked(stack: torch.Tensor, camera: Camera) -> Layers:
     """Layers of a stack [STACKED, H, W] that a camera of its size sees."""
     image = stack.float().permute(1, 2, 0)
-    albedo, normals, room, singles = image.split([3, 3, 3, 4], dim=-1)
-    confidence, gloss, mask, depth = singles.unbind(-1)
+    albedo, normals, room, singles = image.split([3, 3, 3, 5], dim=-1)
+    confidence, gloss, bounce, mask, depth = singles.unbind(-1)
     normals = torch.nn.functional.normalize(normals, dim=-1)
     points = unproject(depth, camera)
-    return Layers(albedo, normals, room, confidence, gloss, mask, points, torch.ones_like(albedo))
+    return Layers(albedo, normals, room, confidence, gloss, bounce, mask, points, torch.ones_like(albedo))
 
 
 def features(layers: Layers, camera: Camera, turn: torch.Tensor) -> torch.Tensor:

@@ -36,7 +36,7 @@ def even(size, mask=1.0, dtype=torch.float32):
     """Layers of an even patch."""
     three = torch.full((size, size, 3), 0.5, dtype=dtype)
     one = torch.full((size, size), mask, dtype=dtype)
-    return Layers(three, three, three, one, one, one, three, torch.ones_like(three))
+    return Layers(three, three, three, one, one, 0.1 * one, one, three, torch.ones_like(three))
 
 
 def random_changes(height, width, seed=0, dtype=torch.float32):
@@ -56,7 +56,7 @@ def test_without_changes_all_stays_as_it_is_and_the_mask_within_what_a_logit_can
 
 def test_albedo_normals_points_confidence_and_gloss_cannot_be_changed(layers):
     after = changed(layers, 100.0 * random_changes(56, 56))
-    for name in ("albedo", "normals_world", "points_world", "confidence", "gloss"):
+    for name in ("albedo", "normals_world", "points_world", "confidence", "gloss", "flash_bounce"):
         assert getattr(after, name) is getattr(layers, name)
 
 
