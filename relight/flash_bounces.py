@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from relight.measured import Measured
 
 _USUAL_SCALE = 0.75  # of the albedo's convention (fair skin), which is a bright one
-_USUAL_CONTRAST = 1e-3  # of J between channels, at which what the frames say counts as much as that
-_LARGEST_SCALE = 1.25
+_USUAL_CONTRAST = 1e-3  # of J between channels at that scale, with which frames say as much as it does
+_LEAST_SCALE, _LARGEST_SCALE = 0.01, 1.25  # of no light a share cannot be told
 _ROUNDS = 2  # the second bounce goes with the square of the scale
 _REWEIGHTINGS = 6
 _SAMPLE = 40_000  # points from which the scale is found
@@ -131,7 +131,7 @@ def flash_bounces(
     for _ in range(_ROUNDS):
         light = at_points(arriving(scale), sample)
         share = _share(measured, sample, normals_world[sample], albedo[sample], light, scale)
-        scale = min(share * scale, _LARGEST_SCALE)
+        scale = min(max(share * scale, _LEAST_SCALE), _LARGEST_SCALE)
     return FlashBounces(at_points(arriving(scale), torch.arange(len(points), device=points.device)), scale)
 
 
@@ -174,8 +174,9 @@ def _share(
         return own - diffuse * ((weight * diffuse * own).sum(dim=0) / square)
 
     left, model = colour_alone(seen), colour_alone(light)
-    prior = float(weight.sum()) * 3.0 * _USUAL_CONTRAST**2
     usual = _USUAL_SCALE / scale
+    # As strong at any scale, and never nothing, so that where no frame tells the usual one remains.
+    prior = max(float(weight.sum()) * 3.0 * (_USUAL_CONTRAST / usual) ** 2, 1e-12)
     share = usual
     for _ in range(_REWEIGHTINGS):
         robust = weight / (1.0 + ((left - share * model) / (2.0 * measured.relative)) ** 2)

@@ -199,6 +199,26 @@ def test_a_gain_of_one_or_none_changes_nothing_and_off_the_mask_it_is_not_looked
         assert torch.equal(shade(CapturedLight(), with_fields(maps, flash_gain=gain), **capture()), plain)
 
 
+def test_maps_that_know_what_bounces_have_it_in_the_flash_and_nowhere_else():
+    maps = random_maps(4, 6)
+    bounce = torch.rand(4, 6, generator=torch.Generator().manual_seed(6), dtype=DOUBLE)
+    bouncing = with_fields(maps, flash_bounce=bounce)
+    factor = 1.0 + bounce[..., None] * maps.albedo
+    for settings in ({}, {"lamp": Lamp(falloff=2.0)}):
+        flash = shade(FlashLight(), maps, **capture(**settings))
+        torch.testing.assert_close(shade(FlashLight(), bouncing, **capture(**settings)), factor * flash)
+    # Gloss stays as it is: what bounces is added to the albedo.
+    glossy, matte = Reflectance(0.0, 0.3, 0.04), Reflectance()
+    gloss = [
+        shade(FlashLight(), both, **capture(reflectance=glossy))
+        - shade(FlashLight(), both, **capture(reflectance=matte))
+        for both in (maps, bouncing)
+    ]
+    torch.testing.assert_close(*gloss)
+    for light in (RoomLight(), DirectionalLight((0, 0, 1)), PointLight((0.3, 0.4, 0.5))):
+        assert torch.equal(shade(light, bouncing, **capture()), shade(light, maps, **capture())), light
+
+
 def test_a_flash_that_the_maps_know_themselves_takes_no_gain():
     maps, own = random_maps(4, 6), torch.full((4, 6, 3), 0.25, dtype=DOUBLE)
     known = with_fields(maps, flash_gain=2.0 * torch.ones(4, 6, 3, dtype=DOUBLE), flash_radiance=own)
