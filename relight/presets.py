@@ -65,12 +65,14 @@ class Preset:
 
 
 _REFINED = "relight.neural.refined.refine:refine_solved"
-_SHAPED = {"shape": ShapeConfig(), "room_gloss": True}
+_SHAPED = {"shape": ShapeConfig(), "room_gloss": True, "sharpening": 1}
 
 PRESETS: dict[str, Preset] = {
     "solve": Preset(),
     "fast": Preset(_REFINED, "relight.neural.refined.config:fast_config", _SHAPED),
-    "balanced": Preset(_REFINED, "relight.neural.refined.config:balanced_config", _SHAPED),
+    "balanced": Preset(
+        _REFINED, "relight.neural.refined.config:balanced_config", _SHAPED | {"sharpening": 2}
+    ),
     "paper": Preset("relight.neural.paper.refine:refine_paper", "relight.neural.paper.config:PaperConfig"),
 }
 
