@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 from relight.errors import PlanError
 from relight.neural.losses.mismatch import BETA
+from relight.neural.precision import PRECISIONS
 
-PRECISIONS = ("float32", "bfloat16")
 DESCRIPTOR_LENGTH = 8
 """L of the paper."""
 

@@ -17,10 +17,11 @@ from relight.alignment import Similarity
 from relight.decoder import Decoder
 from relight.maps import Maps, pull_push, splat_maps, unproject
 from relight.neural.gated_unet import GatedUNet
-from relight.neural.paper.config import DESCRIPTOR_LENGTH, PRECISIONS
+from relight.neural.paper.config import DESCRIPTOR_LENGTH
 from relight.neural.paper.heads import NeuralMaps
 from relight.neural.paper.lighting import flash_distance, flash_image, room_image, towards_camera
 from relight.neural.paper.model import LEVELS, rendered_maps, rendering_network
+from relight.neural.precision import PRECISIONS
 from relight.portrait import Portrait
 from relight.raster import NEAR_M, project, rasterize_ids
 

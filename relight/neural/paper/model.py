@@ -10,6 +10,7 @@ from torch import nn
 from relight.neural.gated_unet import GatedUNet
 from relight.neural.paper.config import DESCRIPTOR_LENGTH, WIDTHS, PaperConfig
 from relight.neural.paper.heads import CHANNELS, NeuralMaps, neural_maps
+from relight.neural.precision import products_in
 from relight.neural.raw_images import raw_images
 
 LEVELS = len(WIDTHS)
@@ -95,6 +96,6 @@ def rendered_maps(
 ) -> NeuralMaps:
     """Maps of a view from the ids of its points, whose sides are multiples of 16."""
     images = raw_images(descriptors, ids)
-    with torch.autocast(descriptors.device.type, torch.bfloat16, enabled=precision == "bfloat16"):
+    with products_in(precision, descriptors.device):
         channels = network(images)
     return neural_maps(channels)

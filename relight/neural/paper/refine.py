@@ -16,6 +16,7 @@ from relight.neural.paper.baking import baked
 from relight.neural.paper.config import PaperConfig
 from relight.neural.paper.fitting import PaperFit
 from relight.neural.perceptual import VggPerceptual, laplacian_perceptual
+from relight.neural.precision import products_in
 from relight.neural.stopwatch import Stopwatch
 from relight.neural.vgg import load_vgg16
 from relight.portrait import Portrait
@@ -117,7 +118,7 @@ def _perceptual(config: PaperConfig, device: torch.device) -> Perceptual:
     network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     def vgg(picture: torch.Tensor, reference: torch.Tensor) -> torch.Tensor:
-        with torch.autocast(device.type, torch.bfloat16, enabled=config.precision == "bfloat16"):
+        with products_in(config.precision, device):
             difference: torch.Tensor = network(picture, reference)
         return difference.float()
 

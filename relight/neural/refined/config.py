@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from relight.errors import PlanError
-
-PRECISIONS = ("float32", "bfloat16")
+from relight.neural.precision import PRECISIONS
 
 
 @dataclass(frozen=True)
@@ -22,7 +21,8 @@ class RefinedConfig:
         widths: Features of the network at each scale.
         check_every: Steps between looks at the held-out frames.
         patience: Looks without gain after which it ends.
-        precision: "float32" or "bfloat16" of the network's products.
+        precision: "float32" of the network's products, or "bfloat16" where the machine has instructions for
+            it.
         exposures: Whether each frame has a small exposure and white-balance residual of its own.
     """
 
@@ -57,7 +57,8 @@ class RefinedConfig:
 
 def fast_config(**settings: object) -> RefinedConfig:
     """Of the preset `fast`."""
-    return RefinedConfig(**settings)  # type: ignore[arg-type]
+    usual: dict[str, object] = {"precision": "bfloat16"}
+    return RefinedConfig(**(usual | settings))  # type: ignore[arg-type]
 
 
 def balanced_config(**settings: object) -> RefinedConfig:
@@ -67,5 +68,6 @@ def balanced_config(**settings: object) -> RefinedConfig:
         "widths": (24, 32, 48, 64),
         "descriptors": 8,
         "check_every": 250,
+        "precision": "bfloat16",
     }
     return RefinedConfig(**(usual | settings))  # type: ignore[arg-type]

@@ -14,8 +14,8 @@ from capture.cameras import Camera
 from relight.alignment import Similarity
 from relight.decoder import Decoder
 from relight.maps import Maps, splat_maps
+from relight.neural.precision import PRECISIONS, products_in
 from relight.neural.raw_images import raw_images
-from relight.neural.refined.config import PRECISIONS
 from relight.neural.refined.layers import Layers, changed, features, layers_of, strided
 from relight.neural.refined.network import RefinedNetwork
 from relight.portrait import Portrait
@@ -167,11 +167,11 @@ def apply_network(
         ids: [H, W] int64, the visible point of each pixel, -1 = none.
         camera: Of the view.
         turn: [3, 3], from the portrait's world to that of the fit.
-        precision: float32 or bfloat16.
+        precision: One of `PRECISIONS`.
     """
     seen = features(layers, camera, turn.to(layers.albedo))
     raw = raw_images(descriptors, strided(ids, network.scales))
-    with torch.autocast(seen.device.type, torch.bfloat16, enabled=precision == "bfloat16"):
+    with products_in(precision, seen.device):
         changes: torch.Tensor = network(seen, raw)
     return changes.float()
 
