@@ -62,8 +62,8 @@ def sharpen(scene: Scene, portrait: Portrait, passes: int, progress: Progress = 
             portrait = replace(portrait, room_radiance=(portrait.room_radiance + lacking).clamp(min=0.0))
             done += len(half)
             progress("sharpen", done / steps)
-        lacking = _lacking_albedo(scene, portrait, lit)
-        lacking = lacking - _mean_over(lacking, neighbours)
+        lacking, known = _lacking_albedo(scene, portrait, lit)
+        lacking = known[:, None] * (lacking - _mean_over(lacking, known, neighbours))
         portrait = replace(portrait, albedo=(portrait.albedo + lacking).clamp(min=0.0))
         done += len(lit)
         progress("sharpen", done / steps)
@@ -82,8 +82,11 @@ def _lacking_room(scene: Scene, portrait: Portrait, views: Sequence[View]) -> to
     return sums / (weights + _ROOM_PRIOR)[:, None]
 
 
-def _lacking_albedo(scene: Scene, portrait: Portrait, views: Sequence[View]) -> torch.Tensor:
-    """Albedo [P, 3] that flash frames show beyond what the portrait draws."""
+def _lacking_albedo(
+    scene: Scene, portrait: Portrait, views: Sequence[View]
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Albedo [P, 3] that flash frames show beyond what the portrait draws, 0 where none shows any; 1 [P]
+    elsewhere."""
     sums, weights = torch.zeros_like(portrait.albedo), torch.zeros_like(portrait.shading)
     known_gains = portrait.info.get("flash_gains", ())
     gains = known_gains if len(known_gains) == len(views) else [1.0] * len(views)
@@ -102,7 +105,7 @@ def _lacking_albedo(scene: Scene, portrait: Portrait, views: Sequence[View]) -> 
         weight = weight * (cosine > GRAZING) * cosine / (1.0 + (lacking.mean(dim=1) / usual) ** 2)
         sums[seen] += (weight * diffuse)[:, None] * lacking
         weights[seen] += weight * diffuse**2
-    return sums / (weights + _ALBEDO_PRIOR)[:, None]
+    return sums / (weights + _ALBEDO_PRIOR)[:, None], (weights > 0).to(sums)
 
 
 def _difference(
@@ -132,9 +135,10 @@ def _difference(
     return seen, samples[:, :3], cosine[seen] * (samples[:, 3] > 0.999)
 
 
-def _mean_over(values: torch.Tensor, neighbours: torch.Tensor) -> torch.Tensor:
-    """Means [P, C] of values over each point's neighbours [P, K]."""
-    total = torch.zeros_like(values)
+def _mean_over(values: torch.Tensor, known: torch.Tensor, neighbours: torch.Tensor) -> torch.Tensor:
+    """Means [P, C] of values over those of each point's neighbours [P, K] that are known [P]."""
+    total, count = torch.zeros_like(values), torch.zeros_like(known)
     for k in range(neighbours.shape[1]):
         total += values[neighbours[:, k]]
-    return total / neighbours.shape[1]
+        count += known[neighbours[:, k]]
+    return total / count.clamp(min=1.0)[:, None]
