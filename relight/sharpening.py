@@ -76,7 +76,7 @@ def _lacking_room(scene: Scene, portrait: Portrait, views: Sequence[View]) -> to
     usual = _USUAL * portrait.room_radiance.mean(dim=1) + _BLACK
     for view in views:
         seen, difference, weight = _difference(scene, portrait, view, 1.0)
-        weight = weight / (1.0 + (difference.mean(dim=1) / usual[seen]) ** 2)
+        weight = weight / (1.0 + (difference.abs().mean(dim=1) / usual[seen]) ** 2)
         sums[seen] += weight[:, None] * difference
         weights[seen] += weight
     return sums / (weights + _ROOM_PRIOR)[:, None]
@@ -102,7 +102,7 @@ def _lacking_albedo(
         strength = gain * colour / square[:, None].clamp(min=1e-12)
         lacking = difference / strength.clamp(min=1e-9)
         usual = _USUAL * portrait.albedo[seen].mean(dim=1) + _BLACK
-        weight = weight * (cosine > GRAZING) * cosine / (1.0 + (lacking.mean(dim=1) / usual) ** 2)
+        weight = weight * (cosine > GRAZING) * cosine / (1.0 + (lacking.abs().mean(dim=1) / usual) ** 2)
         sums[seen] += (weight * diffuse)[:, None] * lacking
         weights[seen] += weight * diffuse**2
     return sums / (weights + _ALBEDO_PRIOR)[:, None], (weights > 0).to(sums)

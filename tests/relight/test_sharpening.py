@@ -215,21 +215,22 @@ def test_an_albedo_that_is_wrong_all_over_stays_as_it_is():
 
 
 @pytest.mark.parametrize("flash", [0, 1])
-def test_something_bright_that_passes_in_one_frame_does_not_enter(flash):
+@pytest.mark.parametrize("adds", [(0.3, 0.3, 0.3), (0.2, -0.1, -0.1)], ids=["bright", "red"])
+def test_what_passes_in_one_frame_does_not_enter(adds, flash):
     frames = [photograph(camera, plain) for camera in cameras(8)]
     radiances = [frame.radiance.copy() for frame in frames]
-    radiances[2 + flash][20:28, 20:28] += 0.3
+    radiances[2 + flash][20:28, 20:28] += adds
     exact = board(ROOM * plain(points()), plain(points()))
     sharp = sharpen(scene_of(frames, radiances), exact, 1)
-    # A mean of the two frames of a half would take in 0.13 of it, one of four lit frames 0.16 of albedo. With
-    # Cauchy's weights nothing counts for more than half of a usual difference, which is 0.026 and 0.05, and
-    # that only at the edge of what passed, where pixels mix it with the board.
-    assert (sharp.room_radiance - exact.room_radiance).abs().max() < 0.008
-    assert (sharp.albedo - exact.albedo).abs().max() < 0.008
+    # A mean of the two frames of a half would take in 0.09 or 0.13 of it, one of four lit frames at least 0.1
+    # of albedo. With Cauchy's weights nothing counts for more than half of a usual difference (0.026 and
+    # 0.05; half as much again in one channel), and that only at the edge, where pixels mix it with the board.
+    assert (sharp.room_radiance - exact.room_radiance).abs().max() < 0.012
+    assert (sharp.albedo - exact.albedo).abs().max() < 0.012
     inside = drawn_at(frames[2 + flash].camera, slice(21, 27))
     assert inside.sum() > 30
-    assert (sharp.room_radiance - exact.room_radiance)[inside].abs().max() < 0.002
-    assert (sharp.albedo - exact.albedo)[inside].abs().max() < 0.003
+    assert (sharp.room_radiance - exact.room_radiance)[inside].abs().max() < 0.006
+    assert (sharp.albedo - exact.albedo)[inside].abs().max() < 0.006
 
 
 @pytest.mark.parametrize("how", ["off the mask", "clipped", "not a number"])
