@@ -347,8 +347,9 @@ def measure_portrait(portrait: Path, source: Path, views: int | None) -> dict[st
     torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", CORES)))
     truth = load_truth(source)
     if views is not None:
-        every = max(1, len(truth.views) // views)
-        truth = replace(truth, views=truth.views[every // 2 :: every])
+        # From end to end: lit frames come at even steps, and are not all that is to be measured.
+        chosen = np.linspace(0, len(truth.views) - 1, min(views, len(truth.views))).round().astype(int)
+        truth = replace(truth, views=[truth.views[k] for k in chosen])
     measures = measure(truth, portrait_renderer(load_portrait(portrait)))
     measures["captured"].pop("by_view", None)
     return {key: measures[key] for key in ("captured", "albedo", "normals", "lights", "mask")}

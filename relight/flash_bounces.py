@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 _USUAL_SCALE = 0.75  # of the albedo's convention (fair skin), which is a bright one
 _USUAL_CONTRAST = 1e-3  # of J between channels at that scale, with which frames say as much as it does
 _LEAST_SCALE, _LARGEST_SCALE = 0.01, 1.25  # of no light a share cannot be told
-_ROUNDS = 2  # the second bounce goes with the square of the scale
+_ROUNDS = 5  # the second bounce goes with the square of the scale, and the albedo with what bounced
 _REWEIGHTINGS = 6
 _SAMPLE = 40_000  # points from which the scale is found
 _LEAST_LIT = 0.02  # albedo or cosine, below which ratios are noise
@@ -55,8 +55,16 @@ class FlashBounces:
 
         In the sense of least squares over frames with weights [K, P] and direct light [K, P].
         """
-        square = (weight * diffuse**2).sum(dim=0).clamp(min=1e-6)
-        return torch.einsum("kp,kpc->pc", weight * diffuse, self.light) / square[:, None]
+        return _excess(weight, diffuse, self.light, 1e-6)
+
+
+def _excess(weight: torch.Tensor, direct: torch.Tensor, light: torch.Tensor, least: float) -> torch.Tensor:
+    """Share [P, 3] of direct light [K, P] that other light [K, P, 3] is of it, by weights [K, P].
+
+    Of a sum of squares below the least one, nothing is told, and the share tends to 0.
+    """
+    square = (weight * direct**2).sum(dim=0).clamp(min=max(least, 1e-12))
+    return torch.einsum("kp,kpc->pc", weight * direct, light) / square[:, None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,12 +110,15 @@ def flash_bounces(
     direct = torch.stack(
         [_direct(inside, solid, lamp, axis, falloff) for lamp, axis in zip(lamps, axes, strict=True)]
     )
-    reflecting = inside.albedo
+    fitted, excess = inside.albedo, torch.zeros_like(inside.albedo)
+    least = _LEAST_LIT * float(direct.amax()) ** 2
 
     def arriving(scale: float) -> torch.Tensor:
-        """[S, K, 3] from other surfels."""
-        inside.albedo = (scale * reflecting).clamp(max=1.0)
+        """[S, K, 3] from other surfels, whose albedo was fitted with what bounced as it was last found."""
+        nonlocal excess
+        inside.albedo = (scale * fitted / (1.0 + excess)).clamp(max=1.0)
         bounced = inside.indirect(direct.T[..., None].expand(-1, -1, 3))
+        excess = _excess(torch.ones_like(direct), direct, bounced.permute(1, 0, 2), least)
         return bounced
 
     def at_points(bounced: torch.Tensor, ids: torch.Tensor) -> torch.Tensor:
@@ -173,7 +184,9 @@ def _share(
         own = (values - values.mean(dim=-1, keepdim=True)).double()
         return own - diffuse * ((weight * diffuse * own).sum(dim=0) / square)
 
-    left, model = colour_alone(seen), colour_alone(light)
+    # The albedo was fitted with what bounced, and is by that too high for either part of the light.
+    excess = _excess(weight[..., 0], diffuse[..., 0].double(), light.double(), 1e-6)
+    left, model = colour_alone(seen), colour_alone(light / (1.0 + excess))
     usual = _USUAL_SCALE / scale
     # As strong at any scale, and never nothing, so that where no frame tells the usual one remains.
     prior = max(float(weight.sum()) * 3.0 * (_USUAL_CONTRAST / usual) ** 2, 1e-12)

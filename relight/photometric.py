@@ -242,7 +242,9 @@ def _bounces(
     known = _known(information, config)
     gauge, _ = _gauge(albedo[known].mean(dim=1), measured.scale, level)
     bounces = flash_bounces(points, normals, surface.spacing, albedo, gauge, known, measured, observations)
-    return bounces, bounces.light * albedo.clamp(min=0.0)
+    diffuse = measured.reflectance.diffuse(measured.flash.cosine(normals))
+    bare = albedo.clamp(min=0.0) / (1.0 + bounces.excess(measured.flash.weight, diffuse))
+    return bounces, bounces.light * bare
 
 
 def _shaped(

@@ -17,7 +17,7 @@ from dataclasses import replace
 import torch
 from scipy.spatial import cKDTree
 
-from relight.lamp import lamp_of_portrait
+from relight.lamp import beam, lamp_of_portrait
 from relight.lighting import FlashLight, shade
 from relight.maps import splat_maps
 from relight.observations import sample_bilinear, visible_points
@@ -54,7 +54,7 @@ def sharpen(scene: Scene, portrait: Portrait, passes: int, progress: Progress = 
     _, near = cKDTree(places).query(places, k=list(range(1, count + 1)), workers=-1)
     neighbours = torch.from_numpy(near).to(portrait.points.device)
     unlit, lit = ([view for view in scene.views if view.flash == flash] for flash in (0, 1))
-    steps = passes * (len(unlit) + len(lit))
+    steps = max(1, passes * (len(unlit) + len(lit)))
     done = 0
     for _ in range(passes):
         for half in (unlit[::2], unlit[1::2]):
@@ -90,7 +90,7 @@ def _lacking_albedo(
     sums, weights = torch.zeros_like(portrait.albedo), torch.zeros_like(portrait.shading)
     known_gains = portrait.info.get("flash_gains", ())
     gains = known_gains if len(known_gains) == len(views) else [1.0] * len(views)
-    colour = torch.tensor(portrait.c_flash).to(portrait.albedo)
+    colour, lamp = torch.tensor(portrait.c_flash).to(portrait.albedo), lamp_of_portrait(portrait.info)
     for view, gain in zip(views, gains, strict=True):
         seen, difference, weight = _difference(scene, portrait, view, gain)
         flash = torch.as_tensor(view.camera.centre_world).to(colour)
@@ -100,6 +100,10 @@ def _lacking_albedo(
         cosine = (towards * portrait.normals_world[seen]).sum(dim=1) / square.sqrt().clamp(min=1e-12)
         diffuse = portrait.reflectance.diffuse(cosine)
         strength = gain * colour / square[:, None].clamp(min=1e-12)
+        if lamp.falloff > 0:
+            axis = torch.as_tensor(lamp.axis_world(view.camera.cam_from_world)).to(colour)
+            to_light = towards / square.sqrt()[:, None].clamp(min=1e-12)
+            strength = strength * beam(to_light, axis, lamp.falloff)[:, None]
         lacking = difference / strength.clamp(min=1e-9)
         usual = _USUAL * portrait.albedo[seen].mean(dim=1) + _BLACK
         weight = weight * (cosine > GRAZING) * cosine / (1.0 + (lacking.abs().mean(dim=1) / usual) ** 2)

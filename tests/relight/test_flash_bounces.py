@@ -125,14 +125,23 @@ def observed(lamps=LAMPS, aim=None, falloff=0.0):
     )
 
 
-def found(subject, measured, gauge=1.0, known=None, observations=None):
-    """Of the subject with its true albedo, which is taken for `gauge` times as bright."""
+def as_fitted(measured, normals):
+    """The albedo [P, 3] that a fit without bounces gives: plain least squares."""
+    flash = measured.flash
+    cosine = (flash.to_light * tensor(normals)).sum(dim=-1)
+    diffuse = (measured.reflectance.diffuse(cosine) * flash.weight)[..., None]
+    matte = flash.response - (measured.reflectance.gloss(cosine) * flash.gloss)[..., None]
+    return (diffuse * matte).sum(dim=0) / (diffuse**2).sum(dim=0).clamp(min=1e-9)
+
+
+def found(subject, measured, gauge=1.0, known=None, observations=None, albedo=None):
+    """Of the subject with the albedo that a fit gives, which is taken for `gauge` times as bright."""
     known = torch.ones(len(subject.points), dtype=torch.bool) if known is None else known
     return flash_bounces(
         tensor(subject.points),
         tensor(subject.normals),
         subject.spacing,
-        tensor(subject.albedo),
+        as_fitted(measured, subject.normals) if albedo is None else tensor(albedo),
         gauge,
         known,
         measured,
@@ -150,12 +159,13 @@ def light():
 def test_the_light_and_its_scale_are_found_however_bright_the_albedo_is_taken(light, gauge):
     subject = corner()
     bounces = found(subject, seen(subject, light), gauge)
-    # Surfels beside the fold do not see what is nearer than themselves; that makes both a little small.
-    assert bounces.scale == pytest.approx(1.0 / gauge, rel=0.08)
+    # Surfels beside the fold do not see what is nearer than themselves, and what bounced there remains in
+    # their albedo, which by so much needs less of a scale.
+    assert bounces.scale == pytest.approx(1.0 / gauge, rel=0.15)
     away = subject.points[:, [0, 2]].sum(axis=1) > 2 * SPACING_M
     ratio = (bounces.light.numpy() / light)[:, away]
     # 128 directions hit a wall that fills a tenth of the sky to about a tenth of it.
-    assert ratio.mean() == pytest.approx(1.0, abs=0.08)
+    assert ratio.mean() == pytest.approx(1.0, abs=0.16)  # by the scale, see above
     assert ratio.std() < 0.12
 
 
@@ -201,7 +211,7 @@ def test_a_narrow_flash_lights_what_bounces_as_it_lights_what_it_is_aimed_at(lig
     assert np.abs(narrow / light - 1.0).max() > 0.3  # it matters
     bounces = found(subject, seen(subject, narrow, **beam), observations=observed(**beam))
     wide = found(subject, seen(subject, light))
-    assert bounces.scale == pytest.approx(1.0, abs=0.08)
+    assert bounces.scale == pytest.approx(1.0, abs=0.15)
     # What the transport errs by is the same for both.
     ratio = (bounces.light / wide.light).numpy() * wide.scale / bounces.scale
     np.testing.assert_allclose(ratio, narrow / light, rtol=0.08)
@@ -248,7 +258,8 @@ def test_points_without_a_known_albedo_send_what_the_usual_one_does(light):
     usual = replace(subject, albedo=np.where(known[:, None], subject.albedo, RED_FLOOR))
     measured = seen(subject, light)
     torch.testing.assert_close(
-        found(wrong, measured, known=known).light, found(usual, measured, known=known).light
+        found(wrong, measured, known=known, albedo=wrong.albedo).light,
+        found(usual, measured, known=known, albedo=usual.albedo).light,
     )
 
 
