@@ -18,14 +18,16 @@ surface facing it has L d^2 / C = 1: the pi of irradiance and the 1/pi of the BR
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import torch
 
 GRAZING = 0.2
 """Cosine below which a flash observation is not used: there the model, the pose and the depth err most."""
 
-_RETROS = (0.0, 0.25, 0.5, 0.75)
+_RETROS = (0.0, 0.25, 0.5, 0.75, 1.0)
 _ALPHAS = (0.08, 0.12, 0.18, 0.25, 0.35, 0.5)
+_STEP, _FACTOR, _FINER = 0.25, 1.4, (2, 4, 8)  # of the grid, and how much finer the search goes on
 _SCALE = 0.02  # residual that counts as noise, for albedos of the order of one half
 _ITERATIONS = 5
 
@@ -115,21 +117,35 @@ def fit_reflectance(cosine: torch.Tensor, response: torch.Tensor, weight: torch.
         weight: [K, P], 0 where there is no observation.
 
     Returns:
-        The best of a grid over `retro` and `alpha`, `f0` by least squares; Lambert if nothing was observed.
+        The best of a grid over `retro` and `alpha` and of ever smaller steps from there (Hooke and Jeeves
+        1961, "Direct search"); `f0` by least squares. Lambert if nothing was observed.
     """
     weight = weight * (cosine > GRAZING) * cosine.clamp(min=0.0)
     weight = weight * ((weight > 0).sum(dim=0) >= 3)  # with one or two frames an albedo explains everything
     total = float(weight.sum(dtype=torch.float64))
     if total <= 0:
         return Reflectance()
-    best, lowest = Reflectance(), float("inf")
-    for retro in _RETROS:
+
+    @cache
+    def fitted(retro: float, alpha: float) -> tuple[float, float]:
+        """f0 and loss."""
         diffuse = Reflectance(retro).diffuse(cosine)
-        for alpha in _ALPHAS:
-            f0, loss = _fit_f0(diffuse, gloss_lobe(cosine, alpha), response, weight)
-            if loss < lowest:
-                best, lowest = Reflectance(retro, alpha, f0), loss
-    return best
+        return _fit_f0(diffuse, gloss_lobe(cosine, alpha), response, weight)
+
+    def loss(pair: tuple[float, float]) -> float:
+        return fitted(*pair)[1]
+
+    best = min(((retro, alpha) for retro in _RETROS for alpha in _ALPHAS), key=loss)
+    for fineness in _FINER:
+        around = [best]
+        while around:
+            retro, alpha = best
+            step, factor = _STEP / fineness, _FACTOR ** (1.0 / fineness)
+            around = [(max(0.0, retro - step), alpha), (retro + step, alpha)]
+            around += [(retro, alpha / factor), (retro, alpha * factor)]
+            around = [pair for pair in around if pair[0] <= _RETROS[-1] and loss(pair) < loss(best)]
+            best = min([best, *around], key=loss)
+    return Reflectance(*best, fitted(*best)[0])
 
 
 def _fit_f0(

@@ -100,12 +100,23 @@ def test_gradients_are_right():
 )
 def test_truth_is_recovered_from_noisy_samples(truth):
     fitted = fit_reflectance(*samples(truth, noise=0.01))
-    # alpha and retro are steps of a grid and the truth is on it; 10,000 samples leave no doubt which.
-    assert fitted.alpha == truth.alpha
-    assert fitted.retro == truth.retro
+    # The truth is on the grid from which the search goes on.
+    assert fitted.alpha == pytest.approx(truth.alpha, rel=0.02)
+    assert fitted.retro == pytest.approx(truth.retro, abs=0.02)
     # f0 is one number from some 30,000 samples of noise 0.01, under a lobe of which 0.3 (rms) is left when
     # albedo has explained what it can: 0.01 / sqrt(30,000) / 0.3 = 0.0002; five times that.
     assert fitted.f0 == pytest.approx(truth.f0, abs=0.001)
+
+
+@pytest.mark.parametrize(
+    "truth", [Reflectance(0.4, 0.3, 0.05), Reflectance(0.6, 0.21, 0.05), Reflectance(0.0, 0.42, 0.08)]
+)
+def test_truth_between_the_steps_of_the_grid_is_found_there(truth):
+    fitted = fit_reflectance(*samples(truth, noise=0.01))
+    # Steps are 0.25 of retro and 30 to 50 % of alpha; a parabola through three losses leaves a tenth of them.
+    assert fitted.alpha == pytest.approx(truth.alpha, rel=0.07)
+    assert fitted.retro == pytest.approx(truth.retro, abs=0.06)
+    assert fitted.f0 == pytest.approx(truth.f0, rel=0.15)  # wider lobes are lower
 
 
 def test_a_matte_subject_is_found_matte():
@@ -120,7 +131,8 @@ def test_a_tenth_of_wrong_samples_does_not_change_the_fit():
     cosine, response, weight = samples(SKIN, noise=0.01)
     wrong = torch.rand(response.shape, generator=torch.Generator().manual_seed(0)) < 0.1
     fitted = fit_reflectance(cosine, torch.where(wrong, 0.0, response), weight)  # in shadow
-    assert (fitted.alpha, fitted.retro) == (SKIN.alpha, SKIN.retro)
+    assert fitted.alpha == pytest.approx(SKIN.alpha, rel=0.1)
+    assert fitted.retro == pytest.approx(SKIN.retro, abs=0.1)
     assert fitted.f0 == pytest.approx(SKIN.f0, rel=0.2)  # less than between the steps of the grid of alpha
 
 
