@@ -36,7 +36,6 @@ absolute; else a scale has to be chosen: the brightest twentieth of the points t
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 
@@ -59,6 +58,7 @@ from relight.scene import Scene
 from relight.shape_from_flash import FlashResponses, ShapeConfig, refine_shape
 from relight.sharpening import sharpen
 from relight.stages import Progress, no_progress
+from relight.standard_errors import standard_errors
 
 _MIRROR_WORTH = 0.03  # of the points that no flash reached, from which on a face is looked for
 _ALBEDO_95_LIMITS = (0.1, 1.3)  # of a subject under a flash whose strength is right
@@ -168,11 +168,17 @@ def solve(scene: Scene, config: SolveConfig = SolveConfig(), progress: Progress 
             :, 0
         ].clamp(min=0.0)
     c_room, shading = _split_room(room, albedo, information > config.known)
-    alike = _alike(flash, reflectance)
-    normal_sigma = _normal_sigma(information / alike, relative, config.normal_sigma_rad)
-    # An error of the normal is one of the cosine, by the tangent, whose square is about 0.5, and so of the
-    # albedo.
-    sigma = (sigma**2 * alike + 0.5 * (normal_sigma * albedo.mean(dim=1) / gauge) ** 2).sqrt()
+    normal_sigma, sigma = standard_errors(
+        points,
+        normals,
+        albedo / gauge,
+        sigma,
+        information,
+        flash,
+        reflectance,
+        relative,
+        config.normal_sigma_rad,
+    )
     share = information / config.known
     portrait = Portrait(
         points=points,
@@ -301,30 +307,6 @@ def _split_room(
     shading = (room * weight).sum(dim=1) / (weight * weight).sum(dim=1).clamp(min=1e-12)
     top = torch.quantile(_sampled(shading[used]), 0.99).clamp(min=1e-6)
     return colour * top, (shading / top).clamp(0.0, 1.0)
-
-
-def _alike(flash: FlashPart, reflectance: Reflectance) -> torch.Tensor:
-    """How many of the flash frames that see a point say the same of it [P], at least 1.
-
-    What the model leaves is no noise: a highlight, a bounce or a fold errs alike in frames whose light comes
-    from about the same side. They count for one within the width of the subject's gloss, which is the
-    narrowest of these.
-    """
-    lit = flash.weight.sum(dim=1, keepdim=True).clamp(min=1e-9)
-    directions = (flash.weight[..., None] * flash.to_light).sum(dim=1) / lit
-    directions = torch.nn.functional.normalize(directions, dim=1)
-    angle = torch.acos((directions @ directions.T).clamp(-1.0, 1.0)).fill_diagonal_(0.0)
-    share = torch.exp(-0.5 * (angle / math.atan(reflectance.alpha)) ** 2)
-    frames = (flash.weight**2).sum(dim=0)
-    return (((share @ flash.weight) * flash.weight).sum(dim=0) / frames.clamp(min=1e-9)).clamp(min=1.0)
-
-
-def _normal_sigma(information: torch.Tensor, relative: float, prior_sigma: float) -> torch.Tensor:
-    """Standard error of the normal, radians: prior and flash frames together."""
-    # A cosine c changes by sin per radian: tangential information is that of the frames times about tan^2 =
-    # 0.5.
-    photometric = 0.5 * information / relative**2
-    return (1.0 / (1.0 / prior_sigma**2 + photometric)).sqrt()
 
 
 def _sampled(values: torch.Tensor) -> torch.Tensor:

@@ -129,8 +129,9 @@ def test_standard_errors_are_those_of_the_errors(frames, cloud, noise):
     )
     # Errors of a surface and of interpolation are no noise; the estimates may be a third off either way. What
     # the model leaves on a real subject is common to frames from one side; this one has noise alone, which is
-    # then overstated by the root of their number, about 1.5.
-    assert 0.4 < spread(albedo_ratio) < 1.6
+    # then overstated by the root of their number, about 1.5; and its bumps may have been rounded, for all that
+    # the points can know.
+    assert 0.35 < spread(albedo_ratio) < 1.6
     # The angle of two components, each with the standard error: rms sqrt(2). The prior of 0.06 rad is wider
     # than this cloud deserves, so the ratio may be well below it, but not above.
     normal_ratio = errors.normals_rad / portrait.normal_sigma_rad[known].numpy()
@@ -197,8 +198,9 @@ def test_gloss_is_not_taken_for_albedo(frames, cloud):
     scene = MemoryScene(frames, noisy(frames), cloud)
     portrait = solve(scene, CONFIG)
     matte = solve(scene, replace(CONFIG, fit_gloss=False))
-    assert portrait.reflectance.alpha == head.alpha
-    assert portrait.reflectance.retro == head.retro
+    # Steps of an eighth of the grid's, among which noise and normals choose.
+    assert portrait.reflectance.alpha == pytest.approx(head.alpha, rel=0.06)
+    assert portrait.reflectance.retro == pytest.approx(head.retro, abs=0.1)
     # In the same units as the albedo; the lobe's foot is alike to albedo, which leaves a fifth undecided.
     assert portrait.reflectance.f0 * portrait.c_flash[0] == pytest.approx(head.f0 * C_FLASH, rel=0.2)
     assert spread(Errors(portrait, head).product) < 0.02
