@@ -48,12 +48,13 @@ from relight.flash_part import BLACK, FlashPart, chunks
 from relight.infill import infill
 from relight.lamp import beam_as_json
 from relight.measured import ALBEDO_95 as ALBEDO_95
-from relight.measured import Measured, measure, measure_room_gloss, separate
+from relight.measured import Measured, Separated, measure, measure_room_gloss, separate
 from relight.mirror_infill import mirror_infill
 from relight.observations import Observations, observe_points
 from relight.point_fits import fit_albedo, fit_normals
 from relight.portrait import Portrait
 from relight.reflectance import Reflectance
+from relight.room_gloss import RoomGloss
 from relight.scene import Scene
 from relight.shape_from_flash import FlashResponses, ShapeConfig, refine_shape
 from relight.sharpening import sharpen
@@ -120,7 +121,37 @@ def solve(scene: Scene, config: SolveConfig = SolveConfig(), progress: Progress 
         scene.points.cpu().numpy(), normals_given, [view.camera for view in scene.views], config.cloud
     )
     progress("cloud", 1.0)
-    observations = observe_points(scene, surface, progress)
+    found = _found(scene, surface, observe_points(scene, surface, progress), config, progress)
+    portrait = _portrait(scene, found, config, progress)
+    del found  # half a gigabyte, for 100 frames
+    return sharpen(scene, portrait, config.sharpening, progress) if config.sharpening > 0 else portrait
+
+
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """What the frames tell before the points are fitted by themselves.
+
+    Attributes:
+        surface: With the normals of its shape, where that is fitted.
+        separated: The room's part and the flash's.
+        measured: The flash's part without what bounced, and what all points share.
+        bounces: What bounced; None = not told from the rest.
+        room: [P, 3] radiance under the room's light, without the gloss that moves.
+        room_gloss: That gloss; None = none.
+    """
+
+    surface: SurfaceCloud
+    separated: Separated
+    measured: Measured
+    bounces: FlashBounces | None
+    room: torch.Tensor
+    room_gloss: RoomGloss | None
+
+
+def _found(
+    scene: Scene, surface: SurfaceCloud, observations: Observations, config: SolveConfig, progress: Progress
+) -> _Found:
+    """Steps 1 and 2, and what changes the surface or the flash's part of the frames."""
     progress("solve", 0.0)
     separated = separate(scene, surface, observations)
     measured = measure(separated, surface, observations, config)
@@ -136,6 +167,12 @@ def solve(scene: Scene, config: SolveConfig = SolveConfig(), progress: Progress 
     room, room_gloss = separated.room, None
     if config.room_gloss:
         room, room_gloss = measure_room_gloss(scene, surface, observations, separated, measured)
+    return _Found(surface, separated, measured, bounces, room, room_gloss)
+
+
+def _portrait(scene: Scene, found: _Found, config: SolveConfig, progress: Progress) -> Portrait:
+    """Steps 3 to 5: every point by itself, and what the flash did not reach."""
+    surface, separated, measured = found.surface, found.separated, found.measured
     flash, relative, reflectance = measured.flash, measured.relative, measured.reflectance
     points = torch.from_numpy(surface.points).to(scene.device)
     prior = torch.from_numpy(surface.normals_world).to(scene.device)
@@ -157,16 +194,15 @@ def solve(scene: Scene, config: SolveConfig = SolveConfig(), progress: Progress 
         filled, worth = mirrored.values, mirrored.information
         from_mirror = float(mirrored.filled.float().mean())
     albedo = infill(points, filled, worth, known=config.known, nearest=surface.spacing)
-    room = infill(points, room, separated.room_information, known=0.3, nearest=surface.spacing)
+    room = infill(points, found.room, separated.room_information, known=0.3, nearest=surface.spacing)
     gauge, warnings = _gauge(albedo[known].mean(dim=1), measured.scale, separated.level)
     albedo = (albedo * gauge).clamp(min=0.0)
     bounce = torch.zeros_like(information)
-    if bounces is not None:
-        excess = bounces.excess(flash.weight, reflectance.diffuse(flash.cosine(normals)))
+    if found.bounces is not None:
+        excess = found.bounces.excess(flash.weight, reflectance.diffuse(flash.cosine(normals)))
         bounce = (excess * albedo).sum(dim=1) / (albedo * albedo).sum(dim=1).clamp(min=BLACK**2)
-        bounce = infill(points, bounce[:, None], information, known=config.known, nearest=surface.spacing)[
-            :, 0
-        ].clamp(min=0.0)
+        bounce = infill(points, bounce[:, None], information, known=config.known, nearest=surface.spacing)
+        bounce = bounce[:, 0].clamp(min=0.0)
     c_room, shading = _split_room(room, albedo, information > config.known)
     normal_sigma, sigma = standard_errors(
         points,
@@ -197,11 +233,11 @@ def solve(scene: Scene, config: SolveConfig = SolveConfig(), progress: Progress 
         c_flash=_three([measured.scale / gauge * share for share in separated.tint]),
         flash_offset_cam_m=_three(torch.as_tensor(scene.flash_offset_cam_m)),
         reflectance=Reflectance(reflectance.retro, reflectance.alpha, reflectance.f0 * gauge),
-        bounce_scale=1.0 if bounces is None else bounces.scale,
+        bounce_scale=1.0 if found.bounces is None else found.bounces.scale,
         info={
             "solver": "photometric",
             "frames": len(scene.views),
-            "flash_frames": sum(flags),
+            "flash_frames": len(flash.weight),
             "flash_gains": [round(float(gain), 4) for gain in measured.gains],
             "relative_noise": round(relative, 4),
             "cloud_noise": surface.noise,
@@ -211,12 +247,9 @@ def solve(scene: Scene, config: SolveConfig = SolveConfig(), progress: Progress 
             "absolute_albedo": separated.level is not None and not warnings,
             "warnings": warnings,
         },
-        room_gloss=room_gloss,
+        room_gloss=found.room_gloss,
     )
-    if not bool(separated.on_subject.all()):
-        portrait = portrait.subset(separated.on_subject)
-    del observations, separated, measured, flash, bounces, bounced  # a gigabyte, for 100 frames
-    return sharpen(scene, portrait, config.sharpening, progress) if config.sharpening > 0 else portrait
+    return portrait if bool(separated.on_subject.all()) else portrait.subset(separated.on_subject)
 
 
 def _known(information: torch.Tensor, config: SolveConfig) -> torch.Tensor:
