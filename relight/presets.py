@@ -66,13 +66,12 @@ class Preset:
 
 _REFINED = "relight.neural.refined.refine:refine_solved"
 _SHAPED = {"shape": ShapeConfig(), "room_gloss": True, "sharpening": 1}
+_CONVERGED = {"shape": ShapeConfig(rounds=4, iterations=30), "room_gloss": True, "sharpening": 2}
 
 PRESETS: dict[str, Preset] = {
     "solve": Preset(),
     "fast": Preset(_REFINED, "relight.neural.refined.config:fast_config", _SHAPED),
-    "balanced": Preset(
-        _REFINED, "relight.neural.refined.config:balanced_config", _SHAPED | {"sharpening": 2}
-    ),
+    "balanced": Preset(_REFINED, "relight.neural.refined.config:balanced_config", _CONVERGED),
     "paper": Preset("relight.neural.paper.refine:refine_paper", "relight.neural.paper.config:PaperConfig"),
 }
 
