@@ -15,11 +15,13 @@ and a usual scale is assumed.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import torch
 
+from relight.flash_part import FlashPart
 from relight.interreflection import Interreflection
 from relight.lamp import beam
 from relight.observations import Observations
@@ -35,6 +37,7 @@ _ROUNDS = 5  # the second bounce goes with the square of the scale, and the albe
 _REWEIGHTINGS = 6
 _SAMPLE = 40_000  # points from which the scale is found
 _LEAST_LIT = 0.02  # albedo or cosine, below which ratios are noise
+_TELLING = 6  # flash frames from which the scale is found; neighbours say nearly the same
 _FRAMES = 8  # whose light is carried to the points at a time
 
 
@@ -113,37 +116,40 @@ def flash_bounces(
     fitted, excess = inside.albedo, torch.zeros_like(inside.albedo)
     least = _LEAST_LIT * float(direct.amax()) ** 2
 
-    def arriving(scale: float) -> torch.Tensor:
+    def arriving(scale: float, frames: slice) -> torch.Tensor:
         """[S, K, 3] from other surfels, whose albedo was fitted with what bounced as it was last found."""
         nonlocal excess
+        lit = direct[frames]
         inside.albedo = (scale * fitted / (1.0 + excess)).clamp(max=1.0)
-        bounced = inside.indirect(direct.T[..., None].expand(-1, -1, 3))
-        excess = _excess(torch.ones_like(direct), direct, bounced.permute(1, 0, 2), least)
+        bounced = inside.indirect(lit.T[..., None].expand(-1, -1, 3))
+        excess = _excess(torch.ones_like(lit), lit, bounced.permute(1, 0, 2), least)
         return bounced
 
-    def at_points(bounced: torch.Tensor, ids: torch.Tensor) -> torch.Tensor:
+    def at_points(bounced: torch.Tensor, ids: torch.Tensor, frames: slice) -> torch.Tensor:
         """[K, N, 3] at points, over what a white surface there would show that faces the flash."""
-        light = points.new_empty(len(lamps), len(ids), 3)
-        for first in range(0, len(lamps), _FRAMES):
+        light = points.new_empty(bounced.shape[1], len(ids), 3)
+        for first in range(0, len(light), _FRAMES):
             some = slice(first, first + _FRAMES)
             values = inside.of_points(bounced[:, some].flatten(1), ids).view(len(ids), -1, 3)
             light[some] = values.permute(1, 0, 2)
-        towards = lamps[:, None] - points[ids]
+        towards = lamps[frames, None] - points[ids]
         square = (towards * towards).sum(dim=-1, keepdim=True)
         if falloff > 0:
-            square = (
-                square / beam(towards / square.sqrt().clamp(min=1e-12), axes[:, None], falloff)[..., None]
-            )
+            to_lamp = towards / square.sqrt().clamp(min=1e-12)
+            square = square / beam(to_lamp, axes[frames, None], falloff)[..., None]
         return light.mul_(square)
 
     sample = (known & measured.on_subject).nonzero()[:, 0]
     sample = sample[:: max(1, len(sample) // _SAMPLE)]
+    telling = slice(None, None, max(1, len(lamps) // _TELLING))
+    flash = measured.flash.of_frames(telling).of(sample)
     scale = _USUAL_SCALE
     for _ in range(_ROUNDS):
-        light = at_points(arriving(scale), sample)
-        share = _share(measured, sample, normals_world[sample], albedo[sample], light, scale)
+        light = at_points(arriving(scale, telling), sample, telling)
+        share = _share(measured, flash, normals_world[sample], albedo[sample], light, scale)
         scale = min(max(share * scale, _LEAST_SCALE), _LARGEST_SCALE)
-    return FlashBounces(at_points(arriving(scale), torch.arange(len(points), device=points.device)), scale)
+    every, whole = torch.arange(len(points), device=points.device), slice(None)
+    return FlashBounces(at_points(arriving(scale, whole), every, whole), scale)
 
 
 def _direct(
@@ -154,29 +160,30 @@ def _direct(
     square = (towards * towards).sum(dim=1).clamp(min=1e-12)
     cosine = (inside.normals_world * towards).sum(dim=1).clamp(min=0.0)
     seen = seen_from(solid, lamp, inside.points_world, inside.normals_world)
-    lit = cosine / square**1.5 * seen
+    # Mean over a disc of the surfel's area, on the lamp's axis: it has a bound where the lamp touches it.
+    spread = square + inside.side**2 / (2.0 * math.pi)
+    lit = cosine / (square.sqrt() * spread) * seen
     return lit * beam(towards / square.sqrt()[:, None], axis, falloff) if falloff > 0 else lit
 
 
 def _share(
     measured: Measured,
-    sample: torch.Tensor,
+    flash: FlashPart,
     normals: torch.Tensor,
     albedo: torch.Tensor,
     light: torch.Tensor,
     scale: float,
 ) -> float:
-    """Which share of some bounced light [K, N, 3] the frames show, told by colour alone.
+    """Which share of some bounced light [K, N, 3] some frames show at some points, told by colour alone.
 
     The prior: at the usual scale it is all of it.
     """
-    flash = measured.flash
-    cosine = (flash.to_light[:, sample] * normals).sum(dim=-1)
+    cosine = flash.cosine(normals)
     diffuse = measured.reflectance.diffuse(cosine)[..., None]
-    gloss = measured.reflectance.gloss(cosine) * flash.gloss[sample]
-    weight = flash.weight[:, sample] * cosine.clamp(min=0.0) * (cosine > _LEAST_LIT)
+    gloss = measured.reflectance.gloss(cosine) * flash.gloss
+    weight = flash.weight * cosine.clamp(min=0.0) * (cosine > _LEAST_LIT)
     weight = (weight * (albedo.amin(dim=1) > _LEAST_LIT))[..., None].double()
-    seen = (flash.response[:, sample] - gloss[..., None]) / albedo.clamp(min=_LEAST_LIT)
+    seen = (flash.response - gloss[..., None]) / albedo.clamp(min=_LEAST_LIT)
     square = (weight * diffuse**2).sum(dim=0).clamp(min=1e-9)
 
     def colour_alone(values: torch.Tensor) -> torch.Tensor:

@@ -44,7 +44,11 @@ class FlashPart:
     to_light: torch.Tensor
     gloss: torch.Tensor
 
-    def of(self, part: slice) -> FlashPart:
+    def of_frames(self, frames: slice) -> FlashPart:
+        """Some of the frames."""
+        return FlashPart(self.response[frames], self.weight[frames], self.to_light[frames], self.gloss)
+
+    def of(self, part: slice | torch.Tensor) -> FlashPart:
         """Some of the points."""
         return FlashPart(
             self.response[:, part], self.weight[:, part], self.to_light[:, part], self.gloss[part]

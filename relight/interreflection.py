@@ -63,6 +63,7 @@ class Interreflection:
         ids: [S] int64, the point that stands for each surfel.
         normals_world: [S, 3], unit, mean of the surfel's points.
         albedo: [S, 3], mean of the surfel's points, times a factor.
+        side: Of a surfel, world units.
         points_world, shading, mask: with normals and albedo the maps that a light falls on; grey ones.
     """
 
@@ -85,7 +86,7 @@ class Interreflection:
         self.albedo = (sums[:, 3:6] / sums[:, 6:]).clamp(0.0, 1.0)
         self.points_world = points[self.ids]
         self.shading = self.mask = torch.ones_like(self.points_world[:, 0])
-        self._points, self._side = points, side
+        self._points, self.side = points, side
         receiver, sender, share = _bundles(self.points_world, self.normals_world, _CELL * side, directions)
         self._transport = _Transport(receiver, sender, share, len(self.ids))
         self._near: tuple[torch.Tensor, torch.Tensor] | None = None
@@ -123,7 +124,7 @@ class Interreflection:
             self._points.cpu().numpy(), k=list(range(1, count + 1)), workers=-1
         )
         # Relative to the nearest, so that the weights cannot all underflow.
-        square = (distances**2 - distances[:, :1] ** 2) / self._side**2
+        square = (distances**2 - distances[:, :1] ** 2) / self.side**2
         weight = torch.from_numpy(np.exp(-0.5 * square).astype(np.float32)).to(self._points)
         ids = torch.from_numpy(near).to(self._points.device)
         # Beside a fold lie surfels of its other side.

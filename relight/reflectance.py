@@ -143,7 +143,9 @@ def fit_reflectance(cosine: torch.Tensor, response: torch.Tensor, weight: torch.
             step, factor = _STEP / fineness, _FACTOR ** (1.0 / fineness)
             around = [(max(0.0, retro - step), alpha), (retro + step, alpha)]
             around += [(retro, alpha / factor), (retro, alpha * factor)]
-            around = [pair for pair in around if pair[0] <= _RETROS[-1] and loss(pair) < loss(best)]
+            # A lobe wider than the grid's cannot be told from albedo any more.
+            around = [p for p in around if p[0] <= _RETROS[-1] and _ALPHAS[0] <= p[1] <= _ALPHAS[-1]]
+            around = [pair for pair in around if loss(pair) < loss(best)]
             best = min([best, *around], key=loss)
     return Reflectance(*best, fitted(*best)[0])
 
