@@ -130,8 +130,8 @@ def test_standard_errors_are_those_of_the_errors(frames, cloud, noise):
     # Errors of a surface and of interpolation are no noise; the estimates may be a third off either way. What
     # the model leaves on a real subject is common to frames from one side; this one has noise alone, which is
     # then overstated by the root of their number, about 1.5; and for all that the points can know, its bumps
-    # may have been rounded.
-    assert 0.35 < spread(albedo_ratio) < 1.6
+    # may have been rounded, which they were not: by another two without noise.
+    assert 0.3 < spread(albedo_ratio) < 1.6
     # The angle of two components, each with the standard error: rms sqrt(2). The prior of 0.06 rad is wider
     # than this cloud deserves, so the ratio may be well below it, but not above.
     normal_ratio = errors.normals_rad / portrait.normal_sigma_rad[known].numpy()
